@@ -1,4 +1,4 @@
-"""Meta-actions become commands: a target speed on a grid, and a lane (presets.md, Commands)."""
+"""Converts meta-actions into commands: a target speed on a grid, and a lane (presets.md, Commands)."""
 
 import math
 from collections.abc import Mapping
@@ -10,36 +10,35 @@ from cosim.road.rules import RED, YELLOW, RulesAhead
 from cosim.types import LANE_OFFSET, Command, Decision, Floats, History, MetaAction
 
 SPEED_STEP = 5.0  # m/s between grid levels: one step of Decelerate must really brake
-SPEED_MARGIN = 2.0  # m/s above the speed limit: the highest level
-LEAST_STEP = 1.0  # m/s: what a step changes at least
-TIME_CONSTANT = 0.6  # s, with which the target speed is tracked
+SPEED_MARGIN = 2.0  # m/s above the speed limit, of the highest level
+MIN_SPEED_STEP = 1.0  # m/s, the smallest change of the target
+TIME_CONSTANT = 0.6  # s, of tracking the target speed
 MAX_DECEL = 8.0  # m/s2
 MAX_ACCEL = 3.0  # m/s2
-COMFORT = 2.8  # m/s2: the most that preset `lawful` accelerates or brakes on an agent's wish
-JERK = 5.0  # m/s3, how fast that changes (ISO 15622: adaptive cruise control at low speeds)
-APPROACH = 2.0  # m/s2, with which stop lines and lower limits are approached
-STOPS_BEFORE = 1.0  # m from a stop line
-CREEP = 2.0  # m/s
-COMFORT_TIME = 1.0  # s, with which a target speed is tracked comfortably
+COMFORT_ACCEL = 2.8  # m/s2, the bound of acceleration and braking on an agent's wish in preset `lawful`
+MAX_JERK = 5.0  # m/s3, of that acceleration (ISO 15622: adaptive cruise control at low speeds)
+APPROACH_DECEL = 2.0  # m/s2, before stop lines and lower speed limits
+STOP_LINE_MARGIN = 1.0  # m before a stop line
+CREEP_SPEED = 2.0  # m/s
+COMFORT_TIME_CONSTANT = 1.0  # s, of tracking the target speed in preset `lawful`
 LANE_CHANGE_TIME = 2.0  # s, the same as SUMO's --lanechange.duration
 _ACTIONS, _ACCELERATE, _DECELERATE = len(MetaAction), int(MetaAction.ACCELERATE), int(MetaAction.DECELERATE)
-_NEVER = 1e9  # s: longer than any rollout
-STEP = 0.1  # s, with which a rollout tracks the target speed (SUMO's step)
+_NO_PERIOD = 1e9  # s between decisions, longer than any rollout
+ROLLOUT_STEP = 0.1  # s, of tracking in a rollout (SUMO's step)
 
 
 def next_target(target: float, speed: float, action: int, speed_limit: float) -> float:
     """The target speed in m/s after a meta-action (presets.md, Commands).
 
     Args:
-        target, speed: m/s, the AV's present target and its own speed.
+        target, speed: m/s, the AV's present target speed and speed.
         action: a `MetaAction`.
-        speed_limit: m/s, of its lane.
+        speed_limit: m/s, of the AV's lane.
 
-    The levels are 0, 5, 10, ... up to the limit, and the limit + 2 on top. Decelerate goes to the highest
-    level at least `LEAST_STEP` below the lower of target and speed, Accelerate to the lowest one as much
-    above the higher: so Decelerate brakes at once, however far the target had run ahead of the speed, and
-    Accelerate ends a braking at once. All others keep the target, on the grid or not, and no target exceeds
-    the top.
+    The levels are 0, 5, 10, ... up to the limit, and the limit + 2 on top. Decelerate chooses the highest
+    level at least `MIN_SPEED_STEP` below the lower of target and speed. Accelerate chooses the lowest level
+    as much above the higher of both. So either takes effect at once, however far the target was from the
+    speed. Other actions keep the target, on the grid or not. No target exceeds the top level.
     """
     return float(_next_target(target, speed, int(action), speed_limit))
 
@@ -49,10 +48,10 @@ def _next_target(target: float, speed: float, action: int, speed_limit: float) -
     top = speed_limit + SPEED_MARGIN
     whole = math.floor(speed_limit / SPEED_STEP + 1e-6)  # the highest multiple of the step in the limit
     if action == _ACCELERATE:
-        level = math.ceil((max(target, speed) + LEAST_STEP) / SPEED_STEP - 1e-6)
+        level = math.ceil((max(target, speed) + MIN_SPEED_STEP) / SPEED_STEP - 1e-6)
         return level * SPEED_STEP if level <= whole else top
     if action == _DECELERATE:
-        below = min(target, speed) - LEAST_STEP
+        below = min(target, speed) - MIN_SPEED_STEP
         level = min(math.floor(below / SPEED_STEP + 1e-6), whole)
         return top if below >= top else max(level, 0) * SPEED_STEP
     return min(target, top)
@@ -60,7 +59,7 @@ def _next_target(target: float, speed: float, action: int, speed_limit: float) -
 
 @compiled
 def tracked_speed(speed: float, target: float, step: float) -> float:
-    """Speed in m/s one simulation step later, tracking a target speed within an AV's limits.
+    """The speed in m/s after one simulation step of tracking a target speed, within an AV's limits.
 
     Args:
         speed, target: m/s. The difference decays with `TIME_CONSTANT`, at -`MAX_DECEL` to `MAX_ACCEL`.
@@ -71,44 +70,44 @@ def tracked_speed(speed: float, target: float, step: float) -> float:
 
 
 def courtesy(svo: float) -> float:
-    """How far a lawful car slows down for vehicles that must change lanes: 0 not at all, 1 as SUMO's drivers.
+    """How far a lawful AV slows down for vehicles that must change lanes: 0 not at all, 1 as SUMO's drivers.
 
-    `svo`: phi in rad. The weight of others in P's eq. (6), sin(phi), as a share of the AV's own, cos(phi).
+    `svo`: phi in rad. The value is the weight of others, sin(phi), over the AV's own, cos(phi) (P, eq. (6)).
     """
     own, others = math.cos(svo), math.sin(svo)
     return 1.0 if others >= own and others > 0.0 else max(others / own, 0.0) if own > 0.0 else 0.0
 
 
 def wished_accel(speed: float, target: float, accel: float, step: float) -> tuple[float, float]:
-    """The acceleration that a target speed asks for in preset `lawful`, and its comfortable course, m/s2.
+    """The acceleration that a target speed asks for in preset `lawful`, and the same with bounded jerk, m/s2.
 
     Args:
         speed, target: m/s.
-        accel: m/s2, of the step before, which `JERK` bounds the change from.
+        accel: m/s2, of the previous step, from which `MAX_JERK` bounds the change.
         step: s.
     """
-    asked = min(max((target - speed) / COMFORT_TIME, -COMFORT), COMFORT)
-    before = min(max(accel, -COMFORT), COMFORT)
-    return asked, min(max(asked, before - JERK * step), before + JERK * step)
+    asked = min(max((target - speed) / COMFORT_TIME_CONSTANT, -COMFORT_ACCEL), COMFORT_ACCEL)
+    before = min(max(accel, -COMFORT_ACCEL), COMFORT_ACCEL)
+    return asked, min(max(asked, before - MAX_JERK * step), before + MAX_JERK * step)
 
 
 @compiled
 def braking_speeds(speed: float, target: float, frames: int, dt: float, period: float) -> Floats:
-    """Speeds while Decelerate is repeated.
+    """The speeds of repeated Decelerate actions.
 
     Args:
-        speed, target: m/s at the start; the target is lowered once already.
-        frames, dt: how many frames ahead, and s between them.
-        period: s between decisions: each lowers the target by one level.
+        speed, target: m/s at the start; the first Decelerate has already lowered the target.
+        frames, dt: the number of frames, and s between them.
+        period: s between decisions; each decision lowers the target by one level.
 
     Returns:
-        [frames+1] m/s, the first entry the present.
+        [frames+1] m/s, from the present on.
     """
     out = np.empty(frames + 1)
     v = speed
     out[0] = v
-    steps = max(round(dt / STEP), 1)
-    left = per_level = max(round(period / STEP), 1)
+    steps = max(round(dt / ROLLOUT_STEP), 1)
+    left = per_level = max(round(period / ROLLOUT_STEP), 1)
     for t in range(1, frames + 1):
         for _ in range(steps):
             if left == 0:
@@ -122,19 +121,19 @@ def braking_speeds(speed: float, target: float, frames: int, dt: float, period: 
 
 @compiled
 def tracked_speeds(speed: float, targets: Floats, frames: int, dt: float) -> Floats:
-    """Speeds while k constant target speeds are tracked.
+    """The speeds of tracking k constant target speeds.
 
     Args:
         speed: m/s at the start.
         targets: [k] m/s.
-        frames, dt: how many frames ahead, and s between them.
+        frames, dt: the number of frames, and s between them.
 
     Returns:
-        [k,frames+1] m/s, the first column the present.
+        [k,frames+1] m/s, from the present on.
     """
     out = np.empty((targets.shape[0], frames + 1))
     for k in range(targets.shape[0]):
-        out[k] = braking_speeds(speed, targets[k], frames, dt, _NEVER)
+        out[k] = braking_speeds(speed, targets[k], frames, dt, _NO_PERIOD)
     return out
 
 
@@ -142,19 +141,19 @@ def tracked_speeds(speed: float, targets: Floats, frames: int, dt: float) -> Flo
 def speeds_ahead(
     target: float, speed: float, limit: float, frames: int, stopping: int, dt: float, period: float
 ) -> tuple[Floats, Floats]:
-    """The speeds that every action leads to, and how far it is to standstill after it.
+    """The speeds that every action leads to, and the stopping distance after it.
 
     Args:
-        target, speed, limit: m/s, the AV's present target, its speed and its lane's speed limit.
-        frames: how many frames of speeds are wanted.
-        stopping: how many frames the way to standstill is added up over.
+        target, speed, limit: m/s, the AV's present target speed, its speed and its lane's speed limit.
+        frames: the number of frames of speeds.
+        stopping: the number of frames over which the stopping distance is summed.
         dt: s between frames.
         period: s between decisions.
 
     Returns:
-        [A+1,frames+1] m/s of the actions held, which for Decelerate means again at every decision; the last
-        row is Decelerate once. [A] m driven within `stopping` frames when Decelerate follows every action
-        from the next decision on.
+        [A+1,frames+1] m/s with the action held. A held Decelerate is repeated at every decision; the last row
+        is a single Decelerate. [A] m driven within `stopping` frames, if Decelerate follows the action from
+        the next decision on.
     """
     targets = np.empty(_ACTIONS + 1)
     for a in range(_ACTIONS):
@@ -174,12 +173,12 @@ def speeds_ahead(
 def braked_from(
     speeds: Floats, target: float, held: int, frames: int, limit: float, dt: float, period: float
 ) -> Floats:
-    """The first `held` frames of a course of speeds, then Decelerate at every decision.
+    """The first `held` frames of given speeds, followed by Decelerate at every decision.
 
     Args:
         speeds: [>held] m/s, every `dt` s.
-        target: m/s, tracked until then.
-        held, frames: frames until the first Decelerate, and in all.
+        target: m/s, tracked in the held frames.
+        held, frames: the number of frames until the first Decelerate, and in all.
         limit: m/s, the lane's speed limit.
         dt, period: s between frames, and between decisions.
 
@@ -196,17 +195,17 @@ def braked_from(
 
 
 def lawful_speed(rules: RulesAhead) -> float:
-    """The highest speed in m/s from which `APPROACH` m/s2 obey all that a car sees of the law ahead.
+    """The highest speed in m/s that obeys the law ahead with a braking of `APPROACH_DECEL`.
 
-    Limits (junction lanes too), red and yellow lights, stop signs and crossings with persons; never below
-    `CREEP`: how the last metres are driven, and whether a line may be passed, is the car's to say.
+    The law: speed limits (of junction lanes too), red and yellow lights, stop signs, crossings with persons.
+    The speed is at least `CREEP_SPEED`: the car itself drives the last metres and decides on passing a line.
     """
-    allowed = np.sqrt(rules.limits[:, 1] ** 2 + 2.0 * APPROACH * rules.limits[:, 0]).min()
+    allowed = np.sqrt(rules.limits[:, 1] ** 2 + 2.0 * APPROACH_DECEL * rules.limits[:, 0]).min()
     at = [rules.stop_distance, rules.person_distance]
     if rules.signal and rules.signal in RED + YELLOW:
         at.append(rules.signal_distance)
-    stop = math.sqrt(2.0 * APPROACH * max(min(at) - STOPS_BEFORE, 0.0))
-    return float(min(allowed, max(stop, CREEP)))
+    stop = math.sqrt(2.0 * APPROACH_DECEL * max(min(at) - STOP_LINE_MARGIN, 0.0))
+    return float(min(allowed, max(stop, CREEP_SPEED)))
 
 
 def to_commands(
@@ -215,16 +214,16 @@ def to_commands(
     """One command per decided AV.
 
     Args:
-        decisions: AV id -> what its policy chose.
-        histories: AV id -> its history, for its target speed, speed, speed limit (m/s) and the law ahead.
+        decisions: AV id -> its policy's decision.
+        histories: AV id -> its history: target speed, speed, speed limit (m/s) and the law ahead.
         hold: s until the next decision.
-        lawful: whether commands keep what is seen of the law ahead (preset `lawful`).
+        lawful: whether commands obey the visible law ahead (preset `lawful`).
     """
     commands = []
     for vehicle, decision in decisions.items():
         history = histories[vehicle]
         limit, highest = math.inf, history.route.speed_limit
-        if lawful:  # a slow lane inside a junction lowers no wish for the road behind it
+        if lawful:  # a slow junction lane does not lower the wish for the road beyond it
             limit, ahead = lawful_speed(history.rules), float(history.rules.limits[:, 1].max())
             highest = ahead if math.isfinite(ahead) else highest
         speed, accel = history.ego_speed, decision.accel

@@ -1,4 +1,4 @@
-"""Finds collisions: SUMO's own list and our oriented-box check for AVs, once per pair, attributed."""
+"""Detects and attributes collisions, once per pair: SUMO's list, and an oriented-box check for AVs."""
 
 from collections.abc import Iterable, Sequence
 
@@ -8,46 +8,46 @@ from cosim.geometry import Boxes, boxes, overlap, overlapping_pairs
 from cosim.road import RoadMap
 from cosim.road.too_close import along_one_another, foot, heed_each_other, walks_beside
 from cosim.simulation.backend import sumo
-from cosim.simulation.commands import Commander, hand_back
+from cosim.simulation.commands import Commander, return_to_sumo
 from cosim.simulation.conventions import centres
 from cosim.simulation.convert import Body
 from cosim.simulation.drivers import Drivers
 from cosim.types import INSERTION, Collision, Floats, Kind, Overlap, Snapshot
 
-SIDE_BY_SIDE = np.radians(20.0)  # lanes whose directions differ by less do not cross
-CUT_IN_WINDOW = 3.0  # s: an AV that changed lanes so shortly before it was hit from behind had cut in
-JUST_INSERTED = 1.0  # s
-HALTING = 0.1  # m/s, SUMO's threshold of a halting vehicle
-STANDS = 0.02  # m between two frames, at that speed
-ON_CENTRE_LINE = 0.3  # m: a front bumper nearer to its lane's centre line is not changing lanes
-DRAWN_WHOLE = 0.99  # m of a lane's shape per m of its length; nets have lanes with less
-WRECK_STANDS = 5.0  # s, then it is taken off the road
-# SUMO's words for a vehicle that hits a person (MSLane::detectPedestrianJunctionCollision).
-OF_PERSONS = frozenset({"sharedLane", "crossing", "walkingarea", "junctionPedestrian"})
-# What brings an overlap about that is no collision (docs/reference/figures.md, Collisions).
+MAX_PARALLEL_ANGLE = np.radians(20.0)  # lanes at a smaller angle do not cross
+CUT_IN_WINDOW = 3.0  # s: an AV hit from behind within this time of its lane change had cut in
+INSERTION_WINDOW = 1.0  # s
+HALTING_SPEED = 0.1  # m/s, SUMO's threshold of a halting vehicle
+MIN_DISPLACEMENT = 0.02  # m between two frames; less is standstill
+CENTRE_LINE_TOLERANCE = 0.3  # m: a front bumper closer to its lane's centre line is not changing lanes
+MIN_DRAWN_SHARE = 0.99  # m of a lane's shape per m of its length; some nets have lanes with less
+WRECK_DURATION = 5.0  # s until a wreck is removed
+# SUMO's types of a collision with a person (MSLane::detectPedestrianJunctionCollision).
+PERSON_COLLISIONS = frozenset({"sharedLane", "crossing", "walkingarea", "junctionPedestrian"})
+# Causes of an overlap that is no collision (docs/reference/figures.md, Collisions).
 HEIGHTS, ASKEW, LANES = CIRCUMSTANCES = ("different heights", "askew", "lanes too close")
 PERSON = Body(Kind.PERSON, False, 0.0, 0.0)
 
 
 class CollisionDetector:
-    """The pairs of one episode, so that each is reported once."""
+    """The collided pairs of one episode; each is reported once."""
 
     def __init__(self) -> None:
-        self._seen: set[frozenset[str]] = set()
+        self._pairs: set[frozenset[str]] = set()
         self._overlaps: dict[tuple[frozenset[str], str], Overlap] = {}
-        self._told = 0  # of these
-        self._lanes: dict[str, int] = {}  # of every AV, in the last snapshot
-        self._inserted: dict[str, float] = {}  # vehicle -> s, of the last second
-        self._before: Snapshot | None = None  # the last one
+        self._reported = 0  # overlaps reported so far
+        self._lanes: dict[str, int] = {}  # AV -> its lane in the last snapshot
+        self._inserted: dict[str, float] = {}  # vehicle -> s, within the last second
+        self._last_snapshot: Snapshot | None = None
 
     def inserted(self, vehicles: Iterable[str], now: float) -> None:
-        """SUMO has put these onto the road in the step that just ended."""
-        recent = {name: t for name, t in self._inserted.items() if now - t <= JUST_INSERTED}
+        """SUMO has inserted these vehicles in the step that just ended."""
+        recent = {name: t for name, t in self._inserted.items() if now - t <= INSERTION_WINDOW}
         self._inserted = {**recent, **dict.fromkeys(vehicles, now)}
 
     def lane_changes(self, snapshot: Snapshot, road: RoadMap, commander: Commander) -> None:
-        """Note for the attribution of cut-ins when an AV that SUMO drives has changed lanes, as the commander
-        does for those it commands."""
+        """Record lane changes of AVs that SUMO drives, for the attribution of cut-ins; the commander records
+        those of commanded AVs."""
         before, self._lanes = self._lanes, {}
         for row in np.flatnonzero(snapshot.kind == Kind.AV):
             name, lane = snapshot.ids[row], int(snapshot.lane[row])
@@ -58,22 +58,22 @@ class CollisionDetector:
                 commander.lane_changes[name] = snapshot.time
 
     def from_sumo(self, bodies: dict[str, Body], changes: dict[str, float], now: float) -> list[Collision]:
-        """What SUMO saw in the step that just ended (`getCollisions`).
+        """The collisions that SUMO found in the step that just ended (`getCollisions`).
 
-        `changes`: AV -> when it last changed lanes, s.
+        `changes`: AV -> s, its last lane change.
         """
         found: list[Collision] = []
         touching = sumo.simulation.getCollidingVehiclesNumber()  # costs less than the list
         for c in sumo.simulation.getCollisions() if touching else ():
-            person = c.type in OF_PERSONS
+            person = c.type in PERSON_COLLISIONS
             names = c.collider, f"person:{c.victim}" if person else c.victim
-            if frozenset(names) in self._seen or any(n not in bodies for n in names[: 1 if person else 2]):
+            if frozenset(names) in self._pairs or any(n not in bodies for n in names[: 1 if person else 2]):
                 continue
-            self._seen.add(frozenset(names))
+            self._pairs.add(frozenset(names))
             pair = _poses(c.collider, c.victim, person)
-            # of two AVs that drive SUMO's order stays: to blame is an AV either way
+            # Two moving AVs keep SUMO's order: an AV caused the collision either way.
             avs = not person and all(bodies[name].kind == Kind.AV for name in names)
-            if pair is not None and not (avs and np.min(pair.speed) > HALTING):
+            if pair is not None and not (avs and np.min(pair.speed) > HALTING_SPEED):
                 first = mover(self._poses_before(names, pair, now), pair)
                 names = names[::-1] if first == 1 else names
             try:
@@ -86,43 +86,43 @@ class CollisionDetector:
     def from_boxes(
         self, snapshot: Snapshot, road: RoadMap, bodies: dict[str, Body], changes: dict[str, float]
     ) -> list[Collision]:
-        """Overlaps of an AV's box with another's that SUMO did not report (it reports 26 of 28).
+        """Overlaps of an AV's box with another box that SUMO did not report (it reports 26 of 28).
 
-        `changes`: AV -> when it last changed lanes, s.
+        `changes`: AV -> s, its last lane change.
         """
         found = []
         for i, j in overlapping_pairs(boxes(snapshot)):
             if snapshot.kind[i] != int(Kind.AV) and snapshot.kind[j] != int(Kind.AV):
                 continue
             names = snapshot.ids[i], snapshot.ids[j]
-            if frozenset(names) in self._seen:
+            if frozenset(names) in self._pairs:
                 continue
-            if excuse := circumstance(snapshot, road, i, j):
-                self._overlaps.setdefault((frozenset(names), excuse), Overlap(snapshot.time, names, excuse))
+            if cause := circumstance(snapshot, road, i, j):
+                self._overlaps.setdefault((frozenset(names), cause), Overlap(snapshot.time, names, cause))
                 continue
-            self._seen.add(frozenset(names))
+            self._pairs.add(frozenset(names))
             pair = boxes(snapshot, np.array([i, j]))
             first = mover(self._poses_before(names, pair, snapshot.time), pair)
-            if first is None:  # neither more than the other
+            if first is None:  # neither moved more into the other
                 first = 0 if snapshot.speed[i] >= snapshot.speed[j] else 1
             a = (i, j)[first]
             lane = road.lanes[snapshot.lane[a]].id if snapshot.lane[a] >= 0 else ""
             x, y = float(snapshot.x[a]), float(snapshot.y[a])
             names = names if first == 0 else names[::-1]
             found.append(self._collision(snapshot.time, names, "overlap", "box", lane, x, y, bodies, changes))
-        self._before = snapshot
+        self._last_snapshot = snapshot
         return found
 
     def overlaps(self) -> tuple[Overlap, ...]:
-        """Those that were no collisions, since this was asked last."""
-        before, self._told = self._told, len(self._overlaps)
+        """The overlaps that were no collisions, since the last call."""
+        before, self._reported = self._reported, len(self._overlaps)
         return tuple(self._overlaps.values())[before:]
 
     # ---- inside ----
 
     def _poses_before(self, names: Sequence[str], pair: Boxes, now: float) -> Boxes:
-        """Where two were in the last frame; who was not there yet is moved back by its speed."""
-        s = self._before
+        """The boxes of two vehicles in the last frame; a new vehicle is moved back by its speed."""
+        s = self._last_snapshot
         elapsed = 0.0 if s is None else now - s.time
         columns = [np.array(column, np.float64) for column in pair]
         columns[0] -= elapsed * pair.speed * np.cos(pair.heading)
@@ -146,37 +146,38 @@ class CollisionDetector:
         changes: dict[str, float],
     ) -> Collision:
         """`names`: collider and victim."""
-        hits, hit = (bodies.get(name, PERSON) for name in names)
+        collider, victim = (bodies.get(name, PERSON) for name in names)
         cut_in = now - changes.get(names[1], -np.inf) <= CUT_IN_WINDOW
-        inserted = any(now - self._inserted.get(name, -np.inf) <= JUST_INSERTED for name in names)
+        inserted = any(now - self._inserted.get(name, -np.inf) <= INSERTION_WINDOW for name in names)
         return Collision(
             time=now,
             collider=names[0],
             victim=names[1],
-            collider_is_av=hits.kind == Kind.AV,
-            victim_is_av=hit.kind == Kind.AV,
+            collider_is_av=collider.kind == Kind.AV,
+            victim_is_av=victim.kind == Kind.AV,
             kind=INSERTION if inserted else kind,
             source=source,
             lane=lane,
             x=x,
             y=y,
-            involves_mission=any(body.mission and not body.guessed for body in (hits, hit)),
-            av_caused=not inserted and (hits.kind == Kind.AV or (hit.kind == Kind.AV and bool(cut_in))),
+            involves_mission=any(body.mission and not body.guessed for body in (collider, victim)),
+            av_caused=not inserted
+            and (collider.kind == Kind.AV or (victim.kind == Kind.AV and bool(cut_in))),
         )
 
 
 class Wrecks:
-    """The vehicles of crashes in an episode that goes on: they stand at once, whoever drove them, and are
-    taken off the road after `WRECK_STANDS` s."""
+    """Crashed vehicles of an episode that goes on: they stop at once, and are removed `WRECK_DURATION` s
+    later."""
 
     def __init__(self, commander: Commander, drivers: Drivers) -> None:
         self._commander, self._drivers = commander, drivers
-        self._since: dict[str, float] = {}  # wreck -> s, when it crashed
+        self._since: dict[str, float] = {}  # wreck -> s, the time of the crash
         self._stopped: list[str] = []  # since the last `take`
         self._removed: list[str] = []
 
     def add(self, collisions: Sequence[Collision]) -> list[str]:
-        """Stop the vehicles of these, and name them; SUMO's insertions onto one another are no crashes."""
+        """Stop the vehicles of these collisions, except of SUMO's insertions; the names of new wrecks."""
         new = []
         on_road = frozenset(sumo.vehicle.getIDList()) if collisions else frozenset()
         for c in collisions:
@@ -186,15 +187,15 @@ class Wrecks:
                     new.append(name)
                     self._commander.wreck(name)
                     self._drivers.drop(name)
-                    sumo.vehicle.setSpeedMode(name, 0)  # at once, not within its deceleration
+                    sumo.vehicle.setSpeedMode(name, 0)  # at once, beyond the vehicle's deceleration
                     sumo.vehicle.setLaneChangeMode(name, 0)
                     sumo.vehicle.setSpeed(name, 0.0)
         self._stopped += new
         return new
 
     def remove(self, now: float) -> bool:
-        """Take those off the road that have stood long enough, and whoever rides in them; whether any did."""
-        due = [name for name, since in self._since.items() if now - since >= WRECK_STANDS - 1e-6]
+        """Remove wrecks that have stood long enough, with their passengers; whether there were any."""
+        due = [name for name, since in self._since.items() if now - since >= WRECK_DURATION - 1e-6]
         on_road = frozenset(sumo.vehicle.getIDList()) if due else frozenset()
         for name in due:
             del self._since[name]
@@ -204,12 +205,12 @@ class Wrecks:
         return bool(due)
 
     def release(self) -> None:
-        """Let those that stand go: SUMO drives them."""
+        """Return the wrecks to SUMO's drivers."""
         for name in self._since.keys() & set(sumo.vehicle.getIDList()):
-            hand_back(name)
+            return_to_sumo(name)
 
     def take(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Who has become a wreck, and which wrecks were removed, since this was asked last."""
+        """The new wrecks and the removed wrecks, since the last call."""
         found = tuple(self._stopped), tuple(self._removed)
         self._stopped.clear()
         self._removed.clear()
@@ -217,15 +218,15 @@ class Wrecks:
 
 
 def mover(before: Boxes, now: Boxes) -> int | None:
-    """Which of two vehicles, 0 or 1, moved into the other; None where neither did more than the other.
+    """The vehicle, 0 or 1, that moved into the other; None if neither moved more than the other.
 
-    `before`, `now`: boxes [2] of the last frame and at contact. A vehicle that stands never did. Of two that
-    move it is the one whose box now overlaps the other's box of before, which the other has not brought
-    about. Where both do or neither does, it is the one that did more to close the gap that was the last to
-    close (of the gaps along the four edge normals; of boxes that overlapped before, the smallest overlap).
+    `before`, `now`: boxes [2] in the last frame and at contact. A standing vehicle never is the mover. Of two
+    moving vehicles, it is the vehicle whose present box overlaps the other's previous box. If both do, or
+    neither, it is the vehicle that closed more of the last gap to close, among those along the four edge
+    normals. Boxes that overlapped before use their smallest overlap.
     """
-    dx, dy = np.asarray(now.x - before.x), np.asarray(now.y - before.y)  # [2] m, own displacements
-    moved = np.hypot(dx, dy) >= STANDS
+    dx, dy = np.asarray(now.x - before.x), np.asarray(now.y - before.y)  # [2] m, displacements
+    moved = np.hypot(dx, dy) >= MIN_DISPLACEMENT
     if not moved.any():
         return None
     if not moved.all():
@@ -251,20 +252,20 @@ def mover(before: Boxes, now: Boxes) -> int | None:
 
 
 def circumstance(snapshot: Snapshot, road: RoadMap, i: int, j: int) -> str:
-    """What brings the overlap of two vehicles about; "" where they have collided."""
+    """The cause of an overlap that is no collision; "" for a collision."""
     if not road.connected(int(snapshot.place[i]), int(snapshot.place[j])):
         return HEIGHTS
-    if only_a_tail(snapshot, road, i, j):
+    if is_askew(snapshot, road, i, j):
         return ASKEW
-    return LANES if the_nets(snapshot, road, i, j) else ""
+    return LANES if is_net_fault(snapshot, road, i, j) else ""
 
 
-def the_nets(snapshot: Snapshot, road: RoadMap, i: int, j: int) -> bool:
-    """Whether two vehicles overlap though each follows its own lane, on lanes whose drivers need not heed one
-    another (`heed_each_other`): the lanes lie too close together, and no driver can help it; or past one that
-    waits where the net lets it wait inside a junction, or past a person on a walking area; or one behind the
-    other where a lane is drawn shorter than it is, with a gap between them by its length."""
-    ways, waits = [], False
+def is_net_fault(snapshot: Snapshot, road: RoadMap, i: int, j: int) -> bool:
+    """Whether the network makes two vehicles overlap though each follows its own lane.
+
+    Their lanes, which need not heed one another (`heed_each_other`), are too close together; a vehicle waits
+    inside a junction; a person is on a walking area; or a lane is drawn too short for the vehicles' gap."""
+    footprints, waiting = [], False
     for row in (i, j):
         lane = int(snapshot.lane[row])
         if walks_beside(road, int(snapshot.place[row])):
@@ -274,27 +275,27 @@ def the_nets(snapshot: Snapshot, road: RoadMap, i: int, j: int) -> bool:
         path = road.path(lane)
         x, y, _ = path.pose(np.array([snapshot.lane_position[row] * path.scale]))
         front = _end(snapshot, row, 0.5)
-        if np.hypot(front[0] - x[0], front[1] - y[0]) > ON_CENTRE_LINE:
+        if np.hypot(front[0] - x[0], front[1] - y[0]) > CENTRE_LINE_TOLERANCE:
             return False
         behind = snapshot.length[row] - snapshot.lane_position[row] * path.scale
-        ways.append(foot(road, lane, behind, _end(snapshot, row, -0.5)))
-        waits |= snapshot.speed[row] < HALTING and road.waits_inside(lane)
-    if len(ways) == 1 or drawn_shorter(snapshot, road, i, j) or drawn_shorter(snapshot, road, j, i):
+        footprints.append(foot(road, lane, behind, _end(snapshot, row, -0.5)))
+        waiting |= snapshot.speed[row] < HALTING_SPEED and road.waits_inside(lane)
+    if len(footprints) == 1 or on_short_lane(snapshot, road, i, j) or on_short_lane(snapshot, road, j, i):
         return True
-    heeds = along_one_another if waits else heed_each_other
-    return not any(heeds(road, a, b) for a in ways[0] for b in ways[1])
+    related = along_one_another if waiting else heed_each_other
+    return not any(related(road, a, b) for a in footprints[0] for b in footprints[1])
 
 
-def drawn_shorter(snapshot: Snapshot, road: RoadMap, last: int, first: int) -> bool:
-    """Whether `last` is behind `first` by the length of their lane, or of its lane and the next, and one of
-    these is drawn shorter than it is long."""
+def on_short_lane(snapshot: Snapshot, road: RoadMap, last: int, first: int) -> bool:
+    """Whether `last` keeps a gap behind `first` by the length of their lane, or of its lane and the next, and
+    one of these lanes is drawn shorter than its length."""
     behind, ahead = (int(snapshot.lane[row]) for row in (last, first))
     along = snapshot.lane_position[first] - snapshot.lane_position[last]  # m
     if behind != ahead:
         if ahead not in road.lanes[behind].successors:
             return False
         along += road.lanes[behind].length
-    shorter = min(road.path(lane).scale for lane in (behind, ahead)) < DRAWN_WHOLE
+    shorter = min(road.path(lane).scale for lane in (behind, ahead)) < MIN_DRAWN_SHARE
     return bool(shorter and along > snapshot.length[first])
 
 
@@ -305,7 +306,7 @@ def _end(snapshot: Snapshot, row: int, share: float) -> Floats:
 
 
 def _poses(vehicle: str, other: str, person: bool) -> Boxes | None:
-    """[2] where a vehicle and another one, or a person, are now; None when one has left the road."""
+    """[2] the boxes of a vehicle and another vehicle, or a person; None if one has left the road."""
     rows = []
     try:
         for get, name in ((sumo.vehicle, vehicle), (sumo.person if person else sumo.vehicle, other)):
@@ -319,31 +320,30 @@ def _poses(vehicle: str, other: str, person: bool) -> Boxes | None:
     return Boxes(*centres(x, y, angle, 0.5 * length), length, width, speed)
 
 
-def only_a_tail(snapshot: Snapshot, road: RoadMap, i: int, j: int) -> bool:
-    """Whether two cars in lanes side by side touch only because one of them stands askew.
+def is_askew(snapshot: Snapshot, road: RoadMap, i: int, j: int) -> bool:
+    """Whether two cars in parallel lanes touch only because a car stands askew.
 
-    SUMO's front moves sideways at 1.6 m/s however slowly the car drives, and its tail follows over the
-    distance driven: after a change at a crawl the car stands askew, its tail in the lane that it has
-    left, where SUMO's own drivers no longer see it (they are lane-based: it has arrived). No car can drive
-    so; laid along its lane, with the front where it is, it touches none.
+    SUMO moves a front sideways at 1.6 m/s at any speed, and the rear follows over the distance driven. After
+    a lane change at a crawl, the rear stays in the lane that the car has left. SUMO's lane-based drivers no
+    longer see it there, and no real car can stand so. Aligned with its lane, the car touches no other.
     """
     a, b = int(snapshot.lane[i]), int(snapshot.lane[j])
     if a < 0 or b < 0 or a == b:
         return False
-    along = np.array([direction(road, snapshot, row) for row in (i, j)])  # [2] rad, of the lanes
-    if abs((along[0] - along[1] + np.pi) % (2 * np.pi) - np.pi) > SIDE_BY_SIDE:
+    along = np.array([lane_direction(road, snapshot, row) for row in (i, j)])  # [2] rad, of the lanes
+    if abs((along[0] - along[1] + np.pi) % (2 * np.pi) - np.pi) > MAX_PARALLEL_ANGLE:
         return False
     rows = np.array([i, j])
     half, heading = 0.5 * snapshot.length[rows], snapshot.heading[rows]
-    laid = boxes(snapshot, rows)._replace(
+    aligned = boxes(snapshot, rows)._replace(
         x=snapshot.x[rows] + half * (np.cos(heading) - np.cos(along)),
         y=snapshot.y[rows] + half * (np.sin(heading) - np.sin(along)),
         heading=along,
     )
-    return not len(overlapping_pairs(laid))
+    return not len(overlapping_pairs(aligned))
 
 
-def direction(road: RoadMap, snapshot: Snapshot, row: int) -> float:
+def lane_direction(road: RoadMap, snapshot: Snapshot, row: int) -> float:
     """The direction of a vehicle's lane at its front bumper, rad."""
     path = road.path(int(snapshot.lane[row]))
     return float(path.pose(np.array([snapshot.lane_position[row] * path.scale]))[2][0])

@@ -1,4 +1,4 @@
-"""Commands become SUMO's calls, each with a receipt that says whether it was carried out, and why not."""
+"""Translates commands into SUMO's calls; a receipt says whether SUMO carried a command out, or why not."""
 
 import math
 from collections.abc import Sequence
@@ -13,11 +13,11 @@ from cosim.types import Command, Intervention, Preset, Receipt, Snapshot
 # SUMO's bit fields (https://sumo.dlr.de/docs/TraCI/Change_Vehicle_State.html): 6 keeps only the physical
 # acceleration limits, so the agent can crash; 31 and 512 let SUMO's own safety override the agent.
 SPEED_MODE = {Preset.UNGUARDED: 6, Preset.GUARDED: 31, Preset.LAWFUL: 31}
-# 513: SUMO's own changes for the route, if they do not contradict the agent's; the gaps of others respected
+# 513: SUMO's lane changes for the route unless they contradict the agent's; respects the gaps of others
 LANE_CHANGE_MODE = {Preset.UNGUARDED: 0, Preset.GUARDED: 512, Preset.LAWFUL: 513}
 SUMO_SPEED_MODE, SUMO_LANE_CHANGE_MODE = 31, 1621  # SUMO's defaults
-SETTLED = 1e-3  # m/s: closer to its target an AV needs no new command
-OVERRULED = 0.05  # m/s: further from the commanded speed another program has set one
+SPEED_TOLERANCE = 1e-3  # m/s: closer to its target an AV needs no new command
+OVERRIDE_TOLERANCE = 0.05  # m/s: at a larger deviation another program has set the speed
 
 
 @dataclass(slots=True)
@@ -26,27 +26,27 @@ class Controlled:
 
     target: float  # m/s
     limit: float = math.inf  # m/s, of the law ahead
-    change: int = 0  # the last lane change: +1 left, -1 right
-    change_until: float = -1.0  # s, when it ends
-    requested: float = -1.0  # m/s, the last speed handed to SUMO
-    asks: float | None = None  # m/s2, in place of the target speed
+    lane_change: int = 0  # +1 left, -1 right, of the last lane change
+    lane_change_until: float = -1.0  # s, the end of the last lane change
+    requested: float = -1.0  # m/s, the last speed sent to SUMO
+    target_accel: float | None = None  # m/s2, replaces the target speed
 
-    def goal(self, speed: float, time: float) -> float:
-        """The speed in m/s to be tracked with the time constant `time` (s) at `speed` (m/s)."""
-        return self.target if self.asks is None else speed + self.asks * time
+    def tracked_target(self, speed: float, time: float) -> float:
+        """The target speed in m/s, for tracking with the time constant `time` (s) at `speed` (m/s)."""
+        return self.target if self.target_accel is None else speed + self.target_accel * time
 
     @property
-    def asked(self) -> float:
-        """The speed in m/s that the last step was to end with, at most; inf where SUMO drove it."""
+    def expected_speed(self) -> float:
+        """The commanded maximum speed in m/s at the end of the last step; inf where SUMO drove the AV."""
         return self.requested
 
     def changing(self, now: float) -> int:
-        """The lane change under way at time `now` (s): +1 left, -1 right, 0 none."""
-        return self.change if now < self.change_until - 1e-9 else 0
+        """The lane change under way at `now` (s): +1 left, -1 right, 0 none."""
+        return self.lane_change if now < self.lane_change_until - 1e-9 else 0
 
 
 class Commander:
-    """Holds every commanded AV at its target speed, step by step, and starts lane changes."""
+    """Drives every commanded AV at its target speed, step by step, and starts lane changes."""
 
     shared = False  # whether other programs command vehicles too
 
@@ -54,11 +54,11 @@ class Commander:
         self._preset = preset
         self._step = step  # s
         self.controlled: dict[str, Controlled] = {}
-        self.lane_changes: dict[str, float] = {}  # AV -> s, start of its last one (attribution of cut-ins)
+        self.lane_changes: dict[str, float] = {}  # AV -> s, start of its last lane change (for cut-ins)
         self._wrecks: set[str] = set()
 
     def take(self, command: Command, now: float) -> Receipt:
-        """Start one command at time `now` (s). A vehicle is taken over from SUMO at its first command."""
+        """Start one command at `now` (s); the first command of a vehicle takes control of it."""
         name = command.vehicle
         if name in self._wrecks:
             return Receipt(name, False, "crashed")
@@ -68,60 +68,60 @@ class Commander:
             return Receipt(name, False, "not on the road")
         state = self.controlled.get(name)
         if state is None:
-            state = self.controlled[name] = self._take_over(name)
+            state = self.controlled[name] = self._take_control(name)
             sumo.vehicle.setSpeedMode(name, SPEED_MODE[self._preset])
             sumo.vehicle.setLaneChangeMode(name, LANE_CHANGE_MODE[self._preset])
         state.target = min(command.target_speed, sumo.vehicle.getMaxSpeed(name))
-        state.limit, state.asks = command.limit, command.accel
+        state.limit, state.target_accel = command.limit, command.accel
         if command.lane_offset == 0:
             return Receipt(name, True)
-        why = (
+        refusal = (
             "a lane change is under way"
             if state.changing(now)
-            else self._forbidden(name, lane, command.lane_offset)
+            else self._refusal(name, lane, command.lane_offset)
         )
-        if why is not None:
-            return Receipt(name, False, why)
+        if refusal is not None:
+            return Receipt(name, False, refusal)
         sumo.vehicle.changeLaneRelative(name, command.lane_offset, command.hold)
-        self._changes(name, state, command.lane_offset, now)
+        self._record_lane_change(name, state, command.lane_offset, now)
         return Receipt(name, True)
 
-    def _hand_back(self, name: str) -> None:
-        """Take back what `_take_over` gave."""
+    def _release_control(self, name: str) -> None:
+        """Undo `_take_control`."""
         sumo.vehicle.setDecel(name, AV_IDM["decel"])
 
-    def _changes(self, name: str, state: Controlled, offset: int, now: float) -> None:
-        state.change = offset
-        state.change_until = now + LANE_CHANGE_TIME
+    def _record_lane_change(self, name: str, state: Controlled, offset: int, now: float) -> None:
+        state.lane_change = offset
+        state.lane_change_until = now + LANE_CHANGE_TIME
         self.lane_changes[name] = now
 
-    def heads_for(self, name: str) -> float | None:
-        """The target speed in m/s of a vehicle that is not commanded yet; None: none is known."""
+    def default_target_speed(self, name: str) -> float | None:
+        """The target speed in m/s of a vehicle without commands; None: unknown."""
         return None
 
-    def _take_over(self, name: str) -> Controlled:
-        """Give the car what it needs to carry commands out."""
+    def _take_control(self, name: str) -> Controlled:
+        """Let the vehicle brake as hard as commands may ask."""
         sumo.vehicle.setDecel(name, MAX_DECEL)
         return Controlled(0.0)
 
-    def _forbidden(self, name: str, lane: str, offset: int) -> str | None:
-        """Why vehicle `name` on `lane` is not to change by `offset` lanes; None if it may."""
-        return _forbidden(name, lane, offset)
+    def _refusal(self, name: str, lane: str, offset: int) -> str | None:
+        """Why vehicle `name` on `lane` must not change by `offset` lanes; None if it may."""
+        return _refusal(name, lane, offset)
 
     def release(self, commanded: Sequence[Command]) -> None:
-        """AVs that got no command this time are handed back to SUMO's own driver."""
+        """Return AVs without a command to SUMO's own driver."""
         names = {c.vehicle for c in commanded}
         for name in [n for n in self.controlled if n not in names]:
             del self.controlled[name]
-            hand_back(name)
-            self._hand_back(name)
+            return_to_sumo(name)
+            self._release_control(name)
 
     def confirm(self, receipts: Sequence[Receipt], commands: Sequence[Command]) -> tuple[Receipt, ...]:
-        """After the hold: a lane change that did not begin was refused by SUMO's safety checks; a speed that
-        is not the commanded one was set by another program."""
+        """The receipts at the end of a decision. SUMO's safety checks refused a lane change that did not
+        begin; another program set a speed other than the commanded one."""
         confirmed = list(receipts)
         if self.shared:
-            confirmed = [self._overruled(receipt) for receipt in receipts]
+            confirmed = [self._check_override(receipt) for receipt in receipts]
         for k, (receipt, command) in enumerate(zip(receipts, commands, strict=True)):
             if not command.lane_offset or not receipt.executed:
                 continue
@@ -129,66 +129,66 @@ class Commander:
             if not state or name not in sumo.vehicle.getIDList():
                 continue
             if abs(sumo.vehicle.getLateralLanePosition(name)) < 0.05:
-                state.change, state.change_until = 0, -1.0
+                state.lane_change, state.lane_change_until = 0, -1.0
                 self.lane_changes.pop(name, None)
                 confirmed[k] = Receipt(name, False, f"refused by SUMO's lane-change safety ({self._preset})")
         return tuple(confirmed)
 
-    def _overruled(self, receipt: Receipt) -> Receipt:
+    def _check_override(self, receipt: Receipt) -> Receipt:
         name, state = receipt.vehicle, self.controlled.get(receipt.vehicle)
         if not receipt.executed or not state or name not in sumo.vehicle.getIDList():
             return receipt
-        more = sumo.vehicle.getSpeed(name) - state.asked  # m/s
-        if more > OVERRULED or (self._preset == Preset.UNGUARDED and more < -OVERRULED):
+        excess = sumo.vehicle.getSpeed(name) - state.expected_speed  # m/s
+        if excess > OVERRIDE_TOLERANCE or (self._preset == Preset.UNGUARDED and excess < -OVERRIDE_TOLERANCE):
             return Receipt(name, False, "another program set its speed")
         return receipt
 
     def drive(self) -> None:
-        """Before every simulation step: track the target speeds."""
+        """Track the target speeds; called before every simulation step."""
         vehicle = sumo.vehicle
         for name, state in self.controlled.items():
             speed = vehicle.getSpeed(name)
-            wanted = tracked_speed(speed, state.goal(speed, TIME_CONSTANT), self._step)
-            news = abs(wanted - state.requested) > SETTLED
-            if news:
+            wanted = tracked_speed(speed, state.tracked_target(speed, TIME_CONSTANT), self._step)
+            new = abs(wanted - state.requested) > SPEED_TOLERANCE
+            if new:
                 state.requested = wanted
-            if news or self.shared:  # another program may have set one
+            if new or self.shared:  # another program may have set a speed
                 vehicle.setSpeed(name, state.requested)
 
-    def see(self, snapshot: Snapshot) -> None:
-        """A new frame, with what every AV knows of it."""
+    def update_percepts(self, snapshot: Snapshot) -> None:
+        """Take a new frame, with the percept of every AV."""
 
-    def observe(self, now: float) -> list[Intervention]:
-        """After every simulation step, at `now` (s): where the car began to drive otherwise than asked."""
+    def find_interventions(self, now: float) -> list[Intervention]:
+        """The interventions that began in the step that ended at `now` (s)."""
         return []
 
     def wreck(self, name: str) -> None:
-        """The vehicle crashed: it stands, and takes no more commands."""
+        """The vehicle has crashed: it stands, and takes no more commands."""
         self.drop(name)
         self._wrecks.add(name)
 
     def drop(self, name: str) -> None:
-        """The vehicle left the road."""
+        """The vehicle has left the road."""
         self.controlled.pop(name, None)
         self.lane_changes.pop(name, None)
 
 
-def hand_back(name: str) -> None:
-    """Let SUMO's own driver drive a vehicle again."""
+def return_to_sumo(name: str) -> None:
+    """Return a vehicle to SUMO's own driver."""
     sumo.vehicle.setSpeed(name, -1.0)
     sumo.vehicle.setSpeedMode(name, SUMO_SPEED_MODE)
     sumo.vehicle.setLaneChangeMode(name, SUMO_LANE_CHANGE_MODE)
 
 
 def force(name: str, accel: float, step: float) -> None:
-    """For one step of `step` s the vehicle accelerates by `accel` m/s2, whatever its own safety says."""
+    """Accelerate a vehicle by `accel` m/s2 for one step of `step` s, without any safety checks."""
     sumo.vehicle.setSpeedMode(name, SPEED_MODE[Preset.UNGUARDED])
     sumo.vehicle.setDecel(name, MAX_DECEL)
     sumo.vehicle.setSpeed(name, max(sumo.vehicle.getSpeed(name) + max(accel, -MAX_DECEL) * step, 0.0))
 
 
-def _forbidden(name: str, lane: str, offset: int) -> str | None:
-    """Why the road does not let vehicle `name` on `lane` change by `offset` lanes; None if it does."""
+def _refusal(name: str, lane: str, offset: int) -> str | None:
+    """Why the road forbids vehicle `name` on `lane` to change by `offset` lanes; None if it does not."""
     if not lane:
         return "not on a lane"
     if lane.startswith(":"):

@@ -1,7 +1,7 @@
-"""What the car of an AV sees of others: the truth, or with a sensing level its percept.
+"""An AV's view of other road users: the true state, or with a sensing level its percept.
 
-A percept is of the last frame. In the steps after it the difference to the truth of that frame is kept, so
-that a vehicle believed 3 m too far back stays so far back until the next frame.
+A percept belongs to the last frame. Its errors in that frame are kept in the steps up to the next frame: a
+vehicle believed 3 m too far back stays 3 m too far back.
 """
 
 import math
@@ -13,20 +13,20 @@ from cosim.road import RoadMap
 from cosim.simulation.backend import sumo
 from cosim.types import Kind, Percept, Snapshot
 
-PERSON = "person:"  # before a person's id in a snapshot
+PERSON = "person:"  # prefix of a person's id in a snapshot
 
 
 class Eyes:
-    """The eyes of all AVs; `open` with every frame."""
+    """The views of all AVs; `update` takes every frame."""
 
     def __init__(self, road: RoadMap) -> None:
         self._road = road
         self._truth: Snapshot | None = None
-        self._vehicles: list[str] = []  # on the road, where sensing is not ideal
+        self._vehicles: list[str] = []  # on the road; empty with ideal sensing
         self._views: dict[str, View] = {}
 
-    def open(self, snapshot: Snapshot) -> None:
-        """A new frame, with percepts unless sensing is ideal."""
+    def update(self, snapshot: Snapshot) -> None:
+        """Take a new frame, with percepts unless sensing is ideal."""
         self._truth = snapshot
         if not self.ideal:
             vehicles = (snapshot.kind != int(Kind.PERSON)).tolist()
@@ -35,48 +35,48 @@ class Eyes:
 
     @property
     def ideal(self) -> bool:
-        """Whether every AV knows everything."""
+        """Whether every AV knows the true state."""
         return self._truth is None or self._truth.percepts is None
 
-    def of(self, av: str) -> Any:
-        """SUMO's calls for vehicles (`sumo.vehicle`) as `av` may make them: of those it knows."""
-        return self._view(av) or sumo.vehicle
+    def view(self, av: str) -> Any:
+        """SUMO's calls for vehicles (`sumo.vehicle`), which answer with what `av` believes."""
+        return self._percept_view(av) or sumo.vehicle
 
     def known(self, av: str, names: Iterable[str]) -> Iterable[str]:
-        """Those of the vehicles that `av` knows of."""
-        view = self._view(av)
+        """The vehicles among `names` that `av` knows of."""
+        view = self._percept_view(av)
         return names if view is None else [name for name in names if name in view.rows]
 
-    def place(self, av: str, person: str) -> tuple[float, float] | None:
-        """Where `av` takes a person to be (m); None: it does not know of the person."""
-        view = self._view(av)
+    def person_position(self, av: str, person: str) -> tuple[float, float] | None:
+        """The position (m) of a person as `av` believes it; None: the person is unknown."""
+        view = self._percept_view(av)
         x, y = sumo.person.getPosition(person)
         if view is None:
             return x, y
         known = view.rows.get(PERSON + person)
         return None if known is None else (x + view.offsets[known][0], y + view.offsets[known][1])
 
-    def is_av(self, av: str, other: str, are: Iterable[str]) -> bool:
-        """Whether `av` takes another vehicle for an AV; `are`: those that are ones."""
-        view = self._view(av)
-        if view is None or other not in are:
-            return other in are
+    def is_av(self, av: str, other: str, avs: Iterable[str]) -> bool:
+        """Whether `av` takes another vehicle for an AV; `avs`: the true AVs."""
+        view = self._percept_view(av)
+        if view is None or other not in avs:
+            return other in avs
         row = view.rows.get(other)
         return row is not None and view.percept.world.kind[row] == Kind.AV
 
     def hears(self, av: str, other: str) -> bool:
-        """Whether what `other` says now reaches `av` in time."""
-        view = self._view(av)
+        """Whether a V2V message of `other` reaches `av` in time."""
+        view = self._percept_view(av)
         return view is None or av == other or other in view.percept.hears
 
-    def unseen(self, av: str) -> list[str]:
+    def unknown(self, av: str) -> list[str]:
         """The vehicles on the road that `av` does not know of."""
-        view = self._view(av)
+        view = self._percept_view(av)
         if view is None:
             return []
         return [name for name in self._vehicles if name not in view.rows and name != av]
 
-    def _view(self, av: str) -> "View | None":
+    def _percept_view(self, av: str) -> "View | None":
         truth = self._truth
         if truth is None or truth.percepts is None or av not in truth.percepts:
             return None
@@ -86,13 +86,12 @@ class Eyes:
 
 
 class View:
-    """`sumo.vehicle` as one AV may use it: states of the vehicles it knows of as it believes them, anything
-    else SUMO's."""
+    """`sumo.vehicle` as one AV may use it: the believed states of known vehicles; other calls go to SUMO."""
 
     def __init__(self, road: RoadMap, av: str, truth: Snapshot, percept: Percept) -> None:
         self.percept, self._road, self._av = percept, road, av
         world = percept.world
-        # vehicle or person -> its row in the percept; those that have left the road since are left out
+        # vehicle or person -> its row in the percept, without those that have left the road since
         self.rows = {name: k for k, name in enumerate(world.ids) if name in truth.row}
         here = [truth.row.get(name, 0) for name in world.ids]
         columns = (
@@ -107,8 +106,8 @@ class View:
     def __getattr__(self, name: str) -> Any:
         return getattr(sumo.vehicle, name)
 
-    def behind_by(self, name: str, heading: float) -> float:
-        """m by which a vehicle is believed behind where it is, in the direction `heading` (rad)."""
+    def position_lag(self, name: str, heading: float) -> float:
+        """m by which the believed position lags behind the true one along `heading` (rad)."""
         dx, dy, *_ = self.offsets[self.rows[name]]
         return -(dx * math.cos(heading) + dy * math.sin(heading))
 
@@ -138,14 +137,14 @@ class View:
         return angle if row is None else angle - math.degrees(self.offsets[row][3])
 
     def getLaneID(self, name: str) -> str:
-        """The lane that it is believed on."""
+        """The lane on which the vehicle is believed to be."""
         row = self.rows.get(name)
         if row is None or self._same_lane[row]:
             return str(sumo.vehicle.getLaneID(name))
         return self._road.lanes[self._lane[row]].id if self._lane[row] >= 0 else ""
 
     def getLanePosition(self, name: str) -> float:
-        """m along that lane, the front bumper"""
+        """m along the believed lane, the front bumper"""
         row = self.rows.get(name)
         if row is None:
             return float(sumo.vehicle.getLanePosition(name))

@@ -263,7 +263,7 @@ class SumoSimulator:
         """Target speed in m/s (None: unknown) and the lane change under way."""
         state = self._commander.controlled.get(vehicle)
         if state is None:
-            return self._commander.heads_for(vehicle), 0
+            return self._commander.default_target_speed(vehicle), 0
         return state.target, state.changing(sumo.simulation.getTime())
 
     @property
@@ -424,7 +424,7 @@ class SumoSimulator:
                 simulation.getStartingTeleportIDList(),
                 simulation.getEmergencyStoppingVehiclesIDList(),
                 self._entries.step(now, [i for i in departed if self._bodies[i].kind == Kind.AV]),
-                self._commander.observe(now),
+                self._commander.find_interventions(now),
                 [sumo.vehicle.getDepartDelay(name) for name in departed],
             )
         )
@@ -494,7 +494,7 @@ class SumoSimulator:
             snapshot = replace(snapshot, events=events)
         if self._perception is not None:
             snapshot = replace(snapshot, percepts=self._perception.perceive(snapshot))
-            self._commander.see(snapshot)
+            self._commander.update_percepts(snapshot)
         return snapshot
 
     def _goal(self) -> tuple[frozenset[int], frozenset[int]]:

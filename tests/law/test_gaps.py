@@ -102,7 +102,7 @@ class Nears:
                     continue
                 via = links[0][4]
                 number = next(k for k, link in enumerate(road.links) if link.via == road.index[via])
-                metres = gaps._before(name, number, get)
+                metres = gaps._to_line(name, number, get)
                 assert metres is not None
                 where = "inside" if lane.startswith(":") else "before"
                 said.setdefault((name, via), []).append((where, metres, odometer))

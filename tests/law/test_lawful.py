@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from conftest import Start, vehicle
 
-from cosim.control import COMFORT, JERK, lawful_speed, wished_accel
+from cosim.control import COMFORT_ACCEL, MAX_JERK, lawful_speed, wished_accel
 from cosim.host import Host
 from cosim.road.rules import RulesAhead
 from cosim.scenario import load
@@ -102,7 +102,7 @@ class Unheeding(Host):
     """A host whose AVs drive without regard to who follows."""
 
     def run(self, *args: object, **options: object) -> EpisodeResult:
-        follower.CLOSES = (0.0, 0.5)
+        follower.INATTENTION = (0.0, 0.5)
         return super().run(*args, **options)  # type: ignore[arg-type]
 
 
@@ -125,7 +125,7 @@ class Unseeing(SumoSimulator):
     """One human keeps his speed whoever is ahead; `told`: whether AVs hear of it from one behind."""
 
     def look_away(self, name: str, told: bool) -> None:
-        follower.TOLD = follower.TOLD if told else (0.0, 0.0)
+        follower.WARNING_RANGE = follower.WARNING_RANGE if told else (0.0, 0.0)
         libsumo.vehicle.setSpeedMode(name, 0)
         libsumo.vehicle.setSpeed(name, 13.0)
 
@@ -242,7 +242,7 @@ def test_who_stands_close_beside_another_stays_where_its_turn_would_touch_him() 
     turn = straight + np.array([[0.0] * 3, [0.0, 0.2, 0.6], [0.0, 0.1, 0.2], [0.0] * 3, [0.0] * 3])
 
     def starts(way: np.ndarray) -> bool:
-        return not any(inside._comes_to(mine, beside) for mine in (way, way + inside.BESIDE))
+        return not any(inside._will_touch(mine, beside) for mine in (way, way + inside.STANDING_MARGIN))
 
     assert starts(straight)
     assert not starts(turn)
@@ -269,17 +269,17 @@ def test_who_stands_inside_a_junction_stays_for_who_may_come_but_not_for_ever_as
     class Full:
         there = False
 
-        def blocked(self, name: str, lane: str, present: bool, waved: object) -> inside.Ahead:
-            return inside.Ahead(0.0) if self.there or not present else inside.CLEAR
+        def way_from_standstill(self, name: str, lane: str, present: bool, waved: object) -> inside.WayOut:
+            return inside.WayOut(0.0) if self.there or not present else inside.CLEAR
 
-        def room(self, name: str, lane: str, waved: object) -> inside.Ahead:
-            return inside.Ahead(3.0) if self.there else inside.CLEAR
+        def way_ahead(self, name: str, lane: str, waved: object) -> inside.WayOut:
+            return inside.WayOut(3.0) if self.there else inside.CLEAR
 
     full = Full()
     rule = way.Way(full, Waves(), STEP)  # type: ignore[arg-type]
 
     def stays(lane: str, speed: float, steps: int = 1) -> int:
-        car = Car(0.0, name="av", lane=lane, speed=speed, inside=lane.startswith(":"))
+        car = Car(0.0, name="av", lane=lane, speed=speed, in_junction=lane.startswith(":"))
         return sum(rule.limit(car).accel < 0.0 for _ in range(steps))
 
     assert stays(":j_0_0", 0.5) == 0, "it rolls"
@@ -289,7 +289,7 @@ def test_who_stands_inside_a_junction_stays_for_who_may_come_but_not_for_ever_as
     full.there = True
     assert stays(":k_0_0", 0.0, 200) == 200, "somebody stands there"
     assert [stays(":k_0_0", speed) for speed in (2.0, 4.0)] == [0, 1], "it stops before him"
-    rule._ahead = lambda *_: (inside.Ahead(3.0), 2.0)  # type: ignore[method-assign]
+    rule._way_ahead = lambda *_: (inside.WayOut(3.0), 2.0)  # type: ignore[method-assign]
     assert stays("w_0", 2.9, 400) == 400, "before its line it waits as long as he stands there"
 
 
@@ -314,9 +314,9 @@ def test_what_the_agent_wishes_is_comfortable_and_its_jerk_bounded() -> None:
         asked, accel = wished_accel(speed, 0.0, accel, STEP)
         speed = max(speed + accel * STEP, 0.0)
         course.append(accel)
-        assert -COMFORT <= asked <= COMFORT
-    assert np.abs(np.diff(course)).max() <= JERK * STEP + 1e-9
-    assert np.abs(course).max() <= COMFORT
+        assert -COMFORT_ACCEL <= asked <= COMFORT_ACCEL
+    assert np.abs(np.diff(course)).max() <= MAX_JERK * STEP + 1e-9
+    assert np.abs(course).max() <= COMFORT_ACCEL
     assert speed < 0.5
 
 

@@ -31,7 +31,7 @@ class Shown(SumoSimulator):
         self.courtesy = courteous
 
     def see_leader_alone(self) -> None:
-        leader.BEYOND = 0
+        leader.VEHICLES_BEYOND_LEADER = 0
 
 
 def driven(worker: object, *avs: str, decisions: int = 30) -> Iterator[Snapshot]:

@@ -48,7 +48,7 @@ class Alone(Watcher):
     def take_away(self, what: str) -> None:
         """`aside`: AVs stay in the middle of their lane; `waves`: they wave nobody through."""
         if what == "aside":
-            setattr(inside.Inside, "_sides", lambda *_: iter((0.0,)))  # noqa: B010
+            setattr(inside.Inside, "_lateral_offsets", lambda *_: iter((0.0,)))  # noqa: B010
         else:
             setattr(waves.Waves, "set", lambda *_: None)  # noqa: B010
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from conftest import Start, vehicle
 
-from cosim.simulation.collisions import WRECK_STANDS
+from cosim.simulation.collisions import WRECK_DURATION
 from cosim.types import INSERTION, Collision, Command, OnCollision, Preset, Receipt, Snapshot
 from cosim.workers.worker import Worker
 
@@ -44,7 +44,7 @@ def test_wrecks_stand_at_once_and_are_taken_off_the_road_after_some_seconds(
     after = [f for f in frames if f.time > crash.time + 0.21 and "a" in f.row]
     assert max(f.speed[f.row["a"]] for f in after) < 1e-9
     gone = next(f for f in frames if "a" not in f.row)
-    assert gone.time - crash.time == pytest.approx(WRECK_STANDS, abs=0.21)
+    assert gone.time - crash.time == pytest.approx(WRECK_DURATION, abs=0.21)
     assert [name for f in frames for name in f.events.wrecked] == ["a", "s"]
     assert sorted(name for f in frames for name in f.events.wrecks_removed) == ["a", "s"]
     assert not [name for f in frames for name in f.events.arrived], "who is taken away has not arrived"

@@ -7,16 +7,16 @@ import pytest
 from cosim.errors import BadInput
 from cosim.scenario.behaviors import IdmParameters, MobilParameters, load_behaviors
 from cosim.simulation.mobil import (
-    FAR,
-    Beside,
+    FREE_ROAD,
     Car,
+    Nearby,
     Situation,
     accelerations,
     best_incentive,
+    change_gain,
     idm_acceleration,
     incentive,
     is_safe,
-    worth,
 )
 from sumo_scenarios import BEHAVIORS
 
@@ -56,86 +56,86 @@ def test_steady_following_keeps_the_minimum_gap_plus_the_time_headway() -> None:
 
 
 def test_a_blocked_lane_beside_a_free_lane_is_worth_leaving() -> None:
-    s = Situation(car(20.0), Beside(20.0, car(10.0)), None, None, None)
+    s = Situation(car(20.0), Nearby(20.0, car(10.0)), None, None, None)
     a = accelerations(s)
     assert a.ego < -5.0
     assert a.ego_after == pytest.approx(3.0 * (1 - 0.8**4))
-    assert worth(a, MODERATE) is not None
+    assert change_gain(a, MODERATE) is not None
     assert incentive(a, 0.3) == pytest.approx(a.ego_after - a.ego)
 
 
 def test_two_equally_free_lanes_give_no_reason_to_change() -> None:
     a = accelerations(Situation(car(20.0), None, None, None, None))
     assert incentive(a, 0.0) == 0.0
-    assert worth(a, MobilParameters(0.0, 0.0, 12.0)) is None
+    assert change_gain(a, MobilParameters(0.0, 0.0, 12.0)) is None
 
 
 def test_a_fast_follower_close_behind_in_the_new_lane_forbids_the_change_whatever_it_is_worth() -> None:
-    s = Situation(car(15.0), Beside(5.0, car(5.0)), None, None, Beside(10.0, car(28.0, 30.0)))
+    s = Situation(car(15.0), Nearby(5.0, car(5.0)), None, None, Nearby(10.0, car(28.0, 30.0)))
     a = accelerations(s)
     assert incentive(a, 0.0) > 10.0
     assert a.new_follower_after < -6.0
     assert not is_safe(a, EGOIST)
-    assert worth(a, EGOIST) is None
-    far_back = accelerations(s._replace(new_follower=Beside(90.0, car(28.0, 30.0))))
-    assert worth(far_back, EGOIST) is not None
+    assert change_gain(a, EGOIST) is None
+    far_back = accelerations(s._replace(new_follower=Nearby(90.0, car(28.0, 30.0))))
+    assert change_gain(far_back, EGOIST) is not None
 
 
 def test_an_aggressive_driver_takes_a_gap_that_a_conservative_one_refuses() -> None:
     drivers = load_behaviors().classes
-    s = Situation(car(20.0), Beside(12.0, car(12.0)), None, None, Beside(14.0, car(22.0)))
+    s = Situation(car(20.0), Nearby(12.0, car(12.0)), None, None, Nearby(14.0, car(22.0)))
     a = accelerations(s)
     assert -12.0 < a.new_follower_after < -2.0
-    assert worth(a, drivers["aggressive"].mobil) is not None
+    assert change_gain(a, drivers["aggressive"].mobil) is not None
     assert not is_safe(a, drivers["conservative"].mobil)
 
 
 def test_full_politeness_refuses_a_change_that_costs_the_follower_more_than_it_gains() -> None:
-    s = Situation(car(22.0), Beside(60.0, car(22.0)), None, Beside(200.0, car(24.0)), Beside(30.0, car(24.0)))
+    s = Situation(car(22.0), Nearby(60.0, car(22.0)), None, Nearby(200.0, car(24.0)), Nearby(30.0, car(24.0)))
     a = accelerations(s)
     own, cost = a.ego_after - a.ego, a.new_follower - a.new_follower_after
     assert own > 0.1
     assert cost > own
     assert is_safe(a, ALTRUIST)
-    assert worth(a, EGOIST) is not None
-    assert worth(a, ALTRUIST) is None
+    assert change_gain(a, EGOIST) is not None
+    assert change_gain(a, ALTRUIST) is None
 
 
 def test_full_politeness_moves_over_for_a_pressing_follower_behind() -> None:
-    s = Situation(car(20.0, 20.0), None, Beside(12.0, car(24.0, 30.0)), None, None)
+    s = Situation(car(20.0, 20.0), None, Nearby(12.0, car(24.0, 30.0)), None, None)
     a = accelerations(s)
     assert a.ego_after == a.ego  # nothing in it for the driver itself
-    assert worth(a, ALTRUIST) is not None
-    assert worth(a, EGOIST) is None
+    assert change_gain(a, ALTRUIST) is not None
+    assert change_gain(a, EGOIST) is None
 
 
 def test_no_politeness_makes_a_driver_brake_harder_than_the_safe_limit_for_others() -> None:
-    s = Situation(car(25.0, 30.0), None, Beside(3.0, car(30.0, 35.0)), Beside(8.0, car(10.0)), None)
+    s = Situation(car(25.0, 30.0), None, Nearby(3.0, car(30.0, 35.0)), Nearby(8.0, car(10.0)), None)
     a = accelerations(s)
     assert incentive(a, 1.0) > 0.1
-    assert worth(a, ALTRUIST) is None
+    assert change_gain(a, ALTRUIST) is None
 
 
 def test_the_new_follower_follows_the_new_leader_across_the_changers_place_until_the_change() -> None:
-    s = Situation(car(20.0), None, None, Beside(30.0, car(20.0)), Beside(15.0, car(20.0)))
+    s = Situation(car(20.0), None, None, Nearby(30.0, car(20.0)), Nearby(15.0, car(20.0)))
     a = accelerations(s)
     assert a.new_follower == pytest.approx(idm_acceleration(MODERATE_IDM, 20.0, 25.0, 50.0, 20.0))
     assert a.new_follower_after == pytest.approx(idm_acceleration(MODERATE_IDM, 20.0, 25.0, 15.0, 20.0))
 
 
 def test_an_empty_lane_bounds_what_any_lane_can_offer() -> None:
-    own = Situation(car(20.0), Beside(30.0, car(18.0)), Beside(10.0, car(21.0)), None, None)
-    for gap_ahead in (5.0, 20.0, 80.0, FAR):
+    own = Situation(car(20.0), Nearby(30.0, car(18.0)), Nearby(10.0, car(21.0)), None, None)
+    for gap_ahead in (5.0, 20.0, 80.0, FREE_ROAD):
         for gap_behind in (5.0, 20.0, 80.0):
             beside = own._replace(
-                new_leader=Beside(gap_ahead, car(19.0)), new_follower=Beside(gap_behind, car(22.0))
+                new_leader=Nearby(gap_ahead, car(19.0)), new_follower=Nearby(gap_behind, car(22.0))
             )
             for p in (0.0, 0.3, 1.0):
                 assert incentive(accelerations(beside), p) <= best_incentive(own, p) + 1e-9
 
 
 def test_overlapping_vehicles_are_never_a_safe_gap() -> None:
-    a = accelerations(Situation(car(20.0), None, None, None, Beside(-2.0, car(20.0))))
+    a = accelerations(Situation(car(20.0), None, None, None, Nearby(-2.0, car(20.0))))
     assert not is_safe(a, MobilParameters(0.0, 0.0, 12.0))
 
 

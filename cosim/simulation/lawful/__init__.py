@@ -1,15 +1,15 @@
-"""The car of preset `lawful`: the agent wishes within the law, which SUMO's own driver keeps.
+"""The car of preset `lawful`: the agent's wish, limited by SUMO's own driver and by five more rules.
 
-Before every simulation step each rule says how much the car may accelerate at most, and why. The smallest
-limit is driven and is the reason that an intervention is reported with:
+Before every simulation step each rule limits the acceleration of the AV and names a reason. The AV drives the
+smallest limit, and an intervention is reported with its reason:
 
-- `wish`: what the agent asks for, comfortably;
-- `driver`: SUMO's driver (speed mode 31): signals, right of way, limits, persons. Where it is the slowest, it
-  drives by itself, so that it brakes as hard as it must;
-- `leader`: following whoever is ahead, and braking early for what begins beyond him;
-- `follower`: room for a human behind who does not brake;
-- `crossing`: lines at which it gives way;
-- `way`: vehicles that stand in its way inside a junction.
+- `wish`: the agent's request, driven comfortably;
+- `driver`: SUMO's driver (speed mode 31): signals, right of way, speed limits, persons. Where its limit is
+  the smallest, SUMO's driver drives by itself and may brake as hard as necessary;
+- `leader`: car following, and early braking for vehicles beyond the leader;
+- `follower`: room for a human follower that does not brake;
+- `crossing`: stop lines at which the AV gives way;
+- `way`: vehicles that block the AV's way inside a junction.
 """
 
 import math
@@ -29,19 +29,19 @@ from cosim.simulation.lawful.way import Way
 from cosim.simulation.lawful.wish import Wish
 from cosim.types import Intervention, Preset, Snapshot
 
-CORRECTED = 1.0  # m/s2 more braking than asked for: from there on the car drives otherwise than commanded
-STALLED = 0.2, 1.5  # m/s2, or so little acceleration where so much was asked for
-RESPITE = 2.0  # s without a correction: the next one is a new one
-HARD = 3.5  # m/s2: harder braking is an emergency's
-LOOKS = 0.4  # s between looks at right of way
-ENTERS = 1.0  # s before a line: so near to it no lane change is begun
-SERVES = 60.0, 100.0  # m that a lane must serve the route at least, and more for every lane to change back
+CORRECTION = 1.0  # m/s2: braking this much harder than the agent asked counts as an intervention
+STALL = 0.2, 1.5  # m/s2: so does less than the first, if the agent asked for more than the second
+MIN_CORRECTION_INTERVAL = 2.0  # s: two corrections closer together count as one intervention
+EMERGENCY_DECEL = 3.5  # m/s2: harder braking is reported as an emergency
+RIGHT_OF_WAY_PERIOD = 0.4  # s between two checks of the right of way
+JUNCTION_LEAD_TIME = 1.0  # s before the stop line, from which no lane change begins
+MIN_ROUTE_LENGTHS = 60.0, 100.0  # m that a lane must serve the route, and m more for each lane change back
 
 
 class Lawful(Commander):
-    """Drives every commanded AV of preset `lawful`."""
+    """Drives every commanded AV in preset `lawful`."""
 
-    controlled: dict[str, Car]  # type: ignore[assignment]  # `_take_over` makes all of them
+    controlled: dict[str, Car]  # type: ignore[assignment]  # `_take_control` makes every entry
 
     def __init__(self, step: float, road: RoadMap, courtesy: float = 1.0) -> None:
         super().__init__(Preset.LAWFUL, step)
@@ -52,131 +52,131 @@ class Lawful(Commander):
         self._crossing = Crossing(fleet, self._driver, road, self._eyes, inside, step)
         self._way = Way(inside, self._waves, step)
         self._wish = Wish(step)
-        # the follower first: whether there must be room decides what else counts
-        first = self._follower, self._wish, self._driver
+        # The follower rule comes first: an evasion changes the limits of the other rules.
+        before_leader = self._follower, self._wish, self._driver
         leader = Leader(self._eyes, self._waves, step)
-        self._rules: tuple[Rule, ...] = *first, leader, self._crossing, self._way
-        self._looked = -math.inf  # s
-        self._begun: list[Intervention] = []
+        self._rules: tuple[Rule, ...] = *before_leader, leader, self._crossing, self._way
+        self._last_check = -math.inf  # s, the last check of the right of way
+        self._interventions: list[Intervention] = []
 
     def drive(self) -> None:
-        """Before every simulation step: what the strictest rule says."""
+        """Apply the strictest rule to every AV; called before every simulation step."""
         now = sumo.simulation.getTime()
-        self._look(now)
-        self._follower.begin()
+        self._update_cars(now)
+        self._follower.begin_step()
         for car in self.controlled.values():
-            made_room = car.makes_room
-            least = min(rule.limit(car) for rule in self._rules)
-            if car.makes_room and not made_room:
-                self._begun.append(Intervention(now, car.name, "emergency: vehicle behind"))
-            self._driver.drive(car, least)
+            was_evading = car.evading
+            strictest = min(rule.limit(car) for rule in self._rules)
+            if car.evading and not was_evading:
+                self._interventions.append(Intervention(now, car.name, "emergency: vehicle behind"))
+            self._driver.drive(car, strictest)
 
-    def see(self, snapshot: Snapshot) -> None:
-        """A new frame, with what every AV knows of it."""
-        self._eyes.open(snapshot)
+    def update_percepts(self, snapshot: Snapshot) -> None:
+        """Take a new frame, with the percept of every AV."""
+        self._eyes.update(snapshot)
         if not self._eyes.ideal:
             for name in self.controlled:
-                self._blind(name)
+                self._hide_unknown(name)
 
-    def observe(self, now: float) -> list[Intervention]:
-        """After every simulation step, at `now` (s): where the car began to drive otherwise than asked."""
-        get, begun = sumo.vehicle, self._begun
-        self._begun = []
+    def find_interventions(self, now: float) -> list[Intervention]:
+        """The interventions that began in the step that ended at `now` (s)."""
+        get, found = sumo.vehicle, self._interventions
+        self._interventions = []
         for name, car in self.controlled.items():
             accel = (get.getSpeed(name) - car.speed) / self._step
-            if accel < min(car.raw, 0.0) - CORRECTED or (car.raw > STALLED[1] and accel < STALLED[0]):
-                if now - car.corrected > RESPITE:
-                    begun.append(Intervention(now, name, self._reason(car, accel)))
-                car.corrected = now
+            if accel < min(car.wished, 0.0) - CORRECTION or (car.wished > STALL[1] and accel < STALL[0]):
+                if now - car.last_correction > MIN_CORRECTION_INTERVAL:
+                    found.append(Intervention(now, name, self._reason(car, accel)))
+                car.last_correction = now
             lateral = get.getLateralLanePosition(name)
-            drift, car.lateral = lateral - car.lateral, lateral
-            if 0.05 < abs(drift) < 1.0 and not car.changing(now):  # SUMO changes lanes for the route
-                self._changes(name, car, 1 if drift > 0.0 else -1, now)
-        return begun
+            drift, car.lateral_offset = lateral - car.lateral_offset, lateral
+            if 0.05 < abs(drift) < 1.0 and not car.changing(now):  # a lane change by SUMO
+                self._record_lane_change(name, car, 1 if drift > 0.0 else -1, now)
+        return found
 
-    def heads_for(self, name: str) -> float | None:
-        """SUMO's driver heads for the limit."""
+    def default_target_speed(self, name: str) -> float | None:
+        """The speed limit, for which SUMO's driver aims."""
         return float(sumo.vehicle.getAllowedSpeed(name))
 
     def drop(self, name: str) -> None:
-        """Also of one that crashed."""
+        """The AV has left the road or has crashed."""
         super().drop(name)
         self._forget(name)
         self._waves.forget(name)
 
     # ---- inside ----
 
-    def _look(self, now: float) -> None:
-        """Where every AV is; from time to time, who gives way."""
+    def _update_cars(self, now: float) -> None:
+        """Read the state of every AV; at intervals, also check the right of way."""
         for car in self.controlled.values():
-            car.look(now)
-        if now - self._looked > LOOKS - 1e-6:
-            self._looked = now
+            car.update(now)
+        if now - self._last_check > RIGHT_OF_WAY_PERIOD - 1e-6:
+            self._last_check = now
             for car in self.controlled.values():
-                self._crossing.look(car, LOOKS)
+                self._crossing.update(car, RIGHT_OF_WAY_PERIOD)
 
     def _reason(self, car: Car, accel: float) -> str:
-        """Of the smallest limit; where it was the agent's, SUMO's driver was slower still."""
-        limit: Limit = car.driven
+        """The reason of the smallest limit; that of SUMO's driver if the limit was the agent's wish."""
+        limit: Limit = car.last_limit
         words = limit.reason if limit.reason not in ("", LAW) else self._driver.reason(car)
-        return f"emergency: {words}" if accel < -HARD else words
+        return f"emergency: {words}" if accel < -EMERGENCY_DECEL else words
 
-    def _take_over(self, name: str) -> Car:
+    def _take_control(self, name: str) -> Car:
         get = sumo.vehicle
-        self._driver.take_over(name)
-        self._blind(name)
+        self._driver.take_control(name)
+        self._hide_unknown(name)
         get.setSpeedFactor(name, min(get.getSpeedFactor(name), 1.0))
-        return Car(0.0, name=name, speed=get.getSpeed(name), lateral=get.getLateralLanePosition(name))
+        return Car(0.0, name=name, speed=get.getSpeed(name), lateral_offset=get.getLateralLanePosition(name))
 
-    def _hand_back(self, name: str) -> None:
-        self._waves.blind(name, ())
-        self._waves.ignore(name, ())
-        self._driver.hand_back(name)
+    def _release_control(self, name: str) -> None:
+        self._waves.hide(name, ())
+        self._waves.ignore_leaders(name, ())
+        self._driver.release_control(name)
         self._forget(name)
 
     def _forget(self, name: str) -> None:
         for rule in self._rules:
             rule.drop(name)
 
-    def _blind(self, name: str) -> None:
-        """SUMO's driver heeds no vehicle that the AV does not know of."""
-        self._waves.blind(name, self._eyes.unseen(name))
+    def _hide_unknown(self, name: str) -> None:
+        """Make SUMO's driver ignore the vehicles that the AV does not know of."""
+        self._waves.hide(name, self._eyes.unknown(name))
 
-    def _forbidden(self, name: str, lane: str, offset: int) -> str | None:
-        why = super()._forbidden(name, lane, offset)
-        if why is None:
-            why = _at_junction(name, lane)
-        if why is None:
-            why = _leaves_route(name, lane, offset)
-            if why is not None:
-                self._begun.append(Intervention(sumo.simulation.getTime(), name, why))
-        return why
+    def _refusal(self, name: str, lane: str, offset: int) -> str | None:
+        refusal = super()._refusal(name, lane, offset)
+        if refusal is None:
+            refusal = _junction_refusal(name, lane)
+        if refusal is None:
+            refusal = _route_refusal(name, lane, offset)
+            if refusal is not None:
+                self._interventions.append(Intervention(sumo.simulation.getTime(), name, refusal))
+        return refusal
 
 
-def _at_junction(name: str, lane: str) -> str | None:
-    """Why a vehicle on `lane` is too near to a junction to change lanes; None if it is not.
+def _junction_refusal(name: str, lane: str) -> str | None:
+    """Why a vehicle on `lane` is too close to a junction to change lanes; None if it is not.
 
-    SUMO draws whoever changes lanes along the lane, and so turns at once a rear that still stands in a
-    junction: a bus into those beside it. And a change that is asked for before a line may begin behind it.
+    SUMO aligns a changing vehicle with its lane at once. The rear of a bus that is still inside the junction
+    then swings into neighbouring vehicles. A change requested before a stop line may begin beyond the line.
     """
     get = sumo.vehicle
-    place = get.getLanePosition(name)
-    if place < get.getLength(name):
+    position = get.getLanePosition(name)
+    if position < get.getLength(name):
         return "still leaving a junction"
-    if sumo.lane.getLength(lane) - place < get.getSpeed(name) * ENTERS:
+    if sumo.lane.getLength(lane) - position < get.getSpeed(name) * JUNCTION_LEAD_TIME:
         return "about to enter a junction"
     return None
 
 
-def _leaves_route(name: str, lane: str, offset: int) -> str | None:
-    """Why the lane at `offset` does not serve the route long enough to change to it; None if it does."""
+def _route_refusal(name: str, lane: str, offset: int) -> str | None:
+    """Why the lane at `offset` serves the route for too short a distance; None if it is long enough."""
     best = sumo.vehicle.getBestLanes(name)
     here = int(lane.rpartition("_")[2])
     if not 0 <= here + offset < len(best):
         return None
     now, then = best[here], best[here + offset]
     at = sumo.vehicle.getLanePosition(name)
-    least, more = SERVES
+    least, more = MIN_ROUTE_LENGTHS
     away = abs(then[3])
     if away <= abs(now[3]) or then[1] - at > least + more * away:
         return None

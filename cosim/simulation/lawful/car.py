@@ -1,4 +1,4 @@
-"""What every rule of the lawful car is given, and what it answers."""
+"""The interface of the lawful car's rules: the state of an AV as their input, a limit as their output."""
 
 import math
 from dataclasses import dataclass
@@ -9,74 +9,74 @@ from cosim.simulation.commands import Controlled
 
 
 class Limit(NamedTuple):
-    """A rule's answer: of all of them the smallest acceleration is driven, and its reason is reported."""
+    """A rule's output: the AV drives the smallest acceleration of all rules and reports its reason."""
 
-    accel: float  # m/s2, at most, in the next step
-    reason: str = ""  # "": the agent asked for it
+    accel: float  # m/s2, the maximum in the next step
+    reason: str = ""  # "" for the agent's own wish
 
 
-TOLERANCE = 1e-3  # m/s: so much slower SUMO's driver still counts as the wish
-LAW = "law"  # the reason of a limit with which SUMO's driver drives by itself
-FREE = Limit(math.inf)  # a rule that does not apply
+TOLERANCE = 1e-3  # m/s: SUMO's driver may be this much slower and the wish still counts as driven
+LAW = "law"  # the reason of a limit that SUMO's driver drives by itself
+NO_LIMIT = Limit(math.inf)  # the output of a rule that does not apply
 
 
 @dataclass(slots=True)
 class Car(Controlled):
-    """One commanded AV, as the rules see it in the step that begins."""
+    """The state of one commanded AV at the beginning of a simulation step."""
 
     name: str = ""
     now: float = 0.0  # s
     speed: float = 0.0  # m/s
-    before: float = 0.0  # m/s, one step earlier
-    lane: str = ""  # "": it is parked, or SUMO carries it elsewhere
-    left: float = math.inf  # m to the end of its lane
-    inside: bool = False  # on a lane inside a junction
-    allowed: float = math.inf  # m/s that SUMO's driver goes to, or would have gone to
-    raw: float = 0.0  # m/s2, what the target alone asks for
-    accel: float = 0.0  # m/s2, of the wish, whose jerk is bounded
-    driven: Limit = FREE  # the limit of the last step
-    commanded: bool = False  # whether it was ours, not SUMO's own
-    lateral: float = 0.0  # m to the left of its lane's centre
-    corrected: float = -math.inf  # s, when it last drove otherwise than asked
-    # what the rules tell one another
+    last_speed: float = 0.0  # m/s, one step earlier
+    lane: str = ""  # "" while the AV is parked or teleports
+    to_line: float = math.inf  # m to the end of the lane, the stop line before a junction
+    in_junction: bool = False  # on an internal lane
+    driver_speed: float = math.inf  # m/s, the speed of SUMO's driver, or its estimate
+    wished: float = 0.0  # m/s2, the agent's wish without the jerk limit
+    commanded_accel: float = 0.0  # m/s2 in the last step, 0 if SUMO's driver drove
+    last_limit: Limit = NO_LIMIT  # of the last step
+    commanded: bool = False  # whether the last speed was commanded, not SUMO's own
+    lateral_offset: float = 0.0  # m to the left of the lane's centre line
+    last_correction: float = -math.inf  # s, the last time of driving otherwise than asked
+    # state that the rules share
     headway: float = 0.8  # s to the leader
-    stands: float = 2.0  # m to one that stands
-    gives_way: bool = False  # at the next junction, or in this one
-    goes: bool = False  # it takes a gap of its own choice
-    holds: bool = False  # before its line, for an AV that would have to brake hard
-    waited: float = 0.0  # s at a line, to give way
-    room_until: float = -math.inf  # s, until when it makes room for the vehicle behind
-    lets_in_until: float = -math.inf  # s, until when it stops before its line for another AV
+    standstill_gap: float = 2.0  # m to a standing leader
+    gives_way: bool = False  # at the next junction, or in the present one
+    takes_gap: bool = False  # the AV has accepted a gap that SUMO's driver would not take
+    held_for_av: bool = False  # the AV waits for AVs with priority that would have to brake hard
+    waiting_time: float = 0.0  # s of waiting at a line to give way
+    evasion_until: float = -math.inf  # s, the end of an evasion from the follower
+    admission_until: float = -math.inf  # s, the end of a stop that admits another AV
 
     @property
-    def makes_room(self) -> bool:
-        """Whether the one behind closes in without braking."""
-        return self.now < self.room_until
+    def evading(self) -> bool:
+        """Whether the AV makes room, because a human follower closes in without braking."""
+        return self.now < self.evasion_until
 
     @property
-    def asked(self) -> float:
-        """As of every commanded AV."""
+    def expected_speed(self) -> float:
+        """See `Controlled`; inf where SUMO's driver drove."""
         return self.requested if self.commanded else math.inf
 
-    def look(self, now: float) -> None:
-        """Read its state from SUMO at `now` (s)."""
+    def update(self, now: float) -> None:
+        """Read the AV's state from SUMO at `now` (s)."""
         get = sumo.vehicle
-        self.now, self.before, self.speed = now, self.speed, get.getSpeed(self.name)
+        self.now, self.last_speed, self.speed = now, self.speed, get.getSpeed(self.name)
         self.lane = get.getLaneID(self.name)
-        self.inside = self.lane.startswith(":")
-        place = get.getLanePosition(self.name)
-        self.left = sumo.lane.getLength(self.lane) - place if self.lane else math.inf
-        # where SUMO's driver drives it is taken to go on as it did; once it stands it may start at any time
-        goes_on = max(2.0 * self.speed - self.before, 0.0)
-        self.allowed = (get.getSpeedWithoutTraCI(self.name) if self.commanded else goes_on) + TOLERANCE
+        self.in_junction = self.lane.startswith(":")
+        position = get.getLanePosition(self.name)
+        self.to_line = sumo.lane.getLength(self.lane) - position if self.lane else math.inf
+        # SUMO's driver is taken to keep its acceleration. SUMO may start a standing driver at any time.
+        expected = max(2.0 * self.speed - self.last_speed, 0.0)
+        self.driver_speed = (get.getSpeedWithoutTraCI(self.name) if self.commanded else expected) + TOLERANCE
 
 
 class Rule:
-    """One reason to drive slower than the agent wishes."""
+    """One reason to drive slower than the agent asks."""
 
     def limit(self, car: Car) -> Limit:
-        """The most that `car` may accelerate in the next step."""
+        """The maximum acceleration of `car` in the next step."""
         raise NotImplementedError
 
     def drop(self, name: str) -> None:
-        """The AV is commanded no more."""
+        """The AV is no longer commanded."""

@@ -1,149 +1,149 @@
-"""Lines at which the AV gives way.
+"""Stop lines at which the AV gives way.
 
-SUMO's driver keeps the right of way. Who has waited long takes a gap of its own choice (`gaps.py`); between
-AVs one lets the other in, and none goes before one that would have to brake hard (V2V).
+SUMO's driver keeps the right of way. After a long wait the AV accepts a gap of its own choice (`gaps.py`). By
+V2V, AVs with priority admit a waiting AV, and an AV without priority makes no other AV brake hard.
 """
 
 from collections.abc import Mapping
 from functools import partial
 
-from cosim.control import COMFORT
+from cosim.control import COMFORT_ACCEL
 from cosim.road import RoadMap
 from cosim.road.rules import RED, YELLOW
 from cosim.simulation.backend import sumo
 from cosim.simulation.eyes import Eyes
-from cosim.simulation.lawful.car import FREE, Car, Limit, Rule
+from cosim.simulation.lawful.car import NO_LIMIT, Car, Limit, Rule
 from cosim.simulation.lawful.driver import Driver
 from cosim.simulation.lawful.gaps import Gaps
 from cosim.simulation.lawful.inside import Inside
-from cosim.simulation.lawful.wish import KEEPS_MOVING, PATIENCE, WAITS
+from cosim.simulation.lawful.wish import LONG_WAIT, MIN_JUNCTION_SPEED, PATIENCE
 
-STOPS_SHORT = 0.5  # m before its line
-DECIDES = 30.0  # m before a line at which it gives way: from there on it looks who comes
-COMES = 100.0  # m from which they come, however many edges that are
-AT_LINE = 5.0  # m: who is further away stands in a queue
-HOLDS = 10.0, 2.6  # m before a line, m/s2: from there on it goes before no AV that would brake harder
-LETS = 1.0  # s for which an AV that is asked lets another one in
-GENTLY = 2.0  # m/s2, with which who lets in can stop before its line
-# where AVs alone come, and where humans do: SUMO adds a share of 180 s stood, which makes humans brake hard
+STOP_MARGIN = 0.5  # m before the stop line
+DECISION_DISTANCE = 30.0  # m before the stop line, from which the AV looks for humans with priority
+APPROACH_RANGE = 100.0  # m, the length of the approaches that are searched, over any number of edges
+HEAD_OF_QUEUE = 5.0  # m to the line: a vehicle further away is queueing
+HOLD_LIMITS = 10.0, 2.6  # m to the line, and m/s2: the AV enters before no AV that would brake harder
+ADMISSION_TIME = 1.0  # s for which an AV stops, once another AV has asked to be admitted
+YIELD_DECEL = 2.0  # m/s2: an AV admits another AV only if this braking stops it before its own line
+# SUMO's impatience if only AVs approach, and with humans (-1 cancels what SUMO adds for time spent waiting)
 IMPATIENCE = 0.8, -1.0
 
 
 class Crossing(Rule):
-    """Limits the acceleration before a line where the AV holds, or lets another one in."""
+    """Limits the acceleration before a line where the AV waits for an AV, or admits one."""
 
     def __init__(
         self, fleet: Mapping[str, Car], driver: Driver, road: RoadMap, eyes: Eyes, inside: Inside, step: float
     ) -> None:
         self._fleet, self._driver, self._eyes, self._step = fleet, driver, eyes, step
         self._gaps = Gaps(road, inside, eyes)
-        self._lane: dict[str, str] = {}  # AV -> the lane from which it takes its gap
-        self._has_let: dict[str, float] = {}  # AV -> s, for which it has let others in at this line
-        self._ways: dict[str, tuple[frozenset[str], frozenset[str]]] = {}  # edge -> `_ways_beside`
+        self._gap_lane: dict[str, str] = {}  # AV -> the lane from which it accepts a gap
+        self._admission_time: dict[str, float] = {}  # AV -> s for which it has admitted others at this line
+        self._approaches: dict[str, tuple[frozenset[str], frozenset[str]]] = {}  # edge -> `_approach_edges`
 
-    def look(self, car: Car, period: float) -> None:
-        """Look ahead who has to give way, every `period` s."""
+    def update(self, car: Car, period: float) -> None:
+        """Check the right of way ahead, every `period` s."""
         if not car.lane:
             return
         red, via = False, ""
-        if not car.inside:
+        if not car.in_junction:
             links = sumo.vehicle.getNextLinks(car.name)
             car.gives_way = bool(links) and not links[0][1]
             red = bool(links) and links[0][5] in RED + YELLOW
             via = links[0][4] if links else ""
-        self._wait(car, red, period)
+        self._update_waiting(car, red, period)
         self._take_gap(car, via)
-        car.holds = car.gives_way and not (red or car.goes) and self._holds(car, via)
+        car.held_for_av = car.gives_way and not (red or car.takes_gap) and self._must_hold(car, via)
 
     def limit(self, car: Car) -> Limit:
         """A comfortable stop before the line."""
-        lets = car.now < car.lets_in_until
-        if car.inside:
-            self._has_let[car.name] = 0.0
-        elif car.lane and (lets or car.holds):
-            self._has_let[car.name] = self._has_let.get(car.name, 0.0) + self._step * lets
-            left = max(car.left - STOPS_SHORT, 0.1)
-            return Limit(max(-car.speed * car.speed / (2.0 * left), -COMFORT), "lets an AV in")
-        return FREE
+        admitting = car.now < car.admission_until
+        if car.in_junction:
+            self._admission_time[car.name] = 0.0
+        elif car.lane and (admitting or car.held_for_av):
+            self._admission_time[car.name] = self._admission_time.get(car.name, 0.0) + self._step * admitting
+            distance = max(car.to_line - STOP_MARGIN, 0.1)
+            return Limit(max(-car.speed * car.speed / (2.0 * distance), -COMFORT_ACCEL), "lets an AV in")
+        return NO_LIMIT
 
     def drop(self, name: str) -> None:
-        """It is commanded no more."""
-        self._lane.pop(name, None)
-        self._has_let.pop(name, None)
+        """The AV is no longer commanded."""
+        self._gap_lane.pop(name, None)
+        self._admission_time.pop(name, None)
 
     # ---- inside ----
 
-    def _wait(self, car: Car, red: bool, period: float) -> None:
-        """Before humans it waits for a gap that nobody brakes for; AVs see it, and brake comfortably.
+    def _update_waiting(self, car: Car, red: bool, period: float) -> None:
+        """Count the waiting time, and set the impatience of SUMO's driver.
 
-        Inside a junction too: there those wait who turn across others. At a red light nobody waits for a gap.
+        AVs with priority may have to brake comfortably, humans not at all. A left turner also waits inside.
         """
-        waits = car.gives_way and not red and car.left < AT_LINE and car.speed < KEEPS_MOVING
-        car.waited = car.waited + period if waits else 0.0
-        humans = car.gives_way and car.left <= DECIDES and self._meets_humans(car.name)
-        self._driver.be_impatient(car.name, IMPATIENCE[humans])
+        waiting = car.gives_way and not red and car.to_line < HEAD_OF_QUEUE and car.speed < MIN_JUNCTION_SPEED
+        car.waiting_time = car.waiting_time + period if waiting else 0.0
+        humans = car.gives_way and car.to_line <= DECISION_DISTANCE and self._humans_approach(car.name)
+        self._driver.set_impatience(car.name, IMPATIENCE[humans])
 
     def _take_gap(self, car: Car, via: str) -> None:
-        """Who has waited long at a line without a signal, or in the junction behind it, judges its gap
-        itself; AVs let it in."""
-        if car.goes and car.inside and car.lane != self._lane[car.name]:  # until it has left the junction
+        """Accept a gap after a long wait, at a line without a signal or inside the junction; AVs with
+        priority admit the AV."""
+        if car.takes_gap and car.in_junction and car.lane != self._gap_lane[car.name]:  # still crossing
             return
-        goes = False
-        if car.waited > WAITS:
-            goes, asked = self._gaps.take(car.name, car.lane, via, partial(self._lets_in, car.name))
+        accepted = False
+        if car.waiting_time > LONG_WAIT:
+            accepted, asked = self._gaps.accept(car.name, car.lane, via, partial(self._can_admit, car.name))
             for other in asked:
-                self._fleet[other].lets_in_until = car.now + LETS
-        if goes != car.goes:
-            car.goes, self._lane[car.name] = goes, car.lane
-            self._driver.go_first(car.name, goes, car.inside)
+                self._fleet[other].admission_until = car.now + ADMISSION_TIME
+        if accepted != car.takes_gap:
+            car.takes_gap, self._gap_lane[car.name] = accepted, car.lane
+            self._driver.set_priority(car.name, accepted, car.in_junction)
 
-    def _holds(self, car: Car, via: str) -> bool:
-        """Whether one that gives way there waits for AVs that would have to brake hard for it (V2V)."""
-        near, hard = HOLDS
-        if car.left > near or car.speed**2 > 2.0 * COMFORT * max(car.left - STOPS_SHORT, 0.1):
+    def _must_hold(self, car: Car, via: str) -> bool:
+        """Whether the AV waits, because AVs with priority would have to brake hard (V2V)."""
+        distance, hard = HOLD_LIMITS
+        if car.to_line > distance or car.speed**2 > 2.0 * COMFORT_ACCEL * max(car.to_line - STOP_MARGIN, 0.1):
             return False
-        return self._gaps.brakes(car.name, car.lane, via, self._step, partial(self._comes, car.name)) > hard
+        return self._gaps.braking(car.name, car.lane, via, self._step, partial(self._is_foe, car.name)) > hard
 
-    def _comes(self, asks: str, name: str) -> bool:
-        """Whether it is an AV that lets nobody in, as far as the one that `asks` hears of it."""
+    def _is_foe(self, other: str, name: str) -> bool:
+        """Whether `name` is an AV that admits no other AV, as far as `other` knows by V2V."""
         car = self._fleet.get(name)
-        return car is not None and self._eyes.hears(asks, name) and car.lets_in_until < car.now
+        return car is not None and self._eyes.hears(other, name) and car.admission_until < car.now
 
-    def _lets_in(self, asks: str, name: str, before: float) -> bool | None:
-        """Whether it is an AV that can stop comfortably so many m before its line, and has not for long; None
-        for an AV that takes its own gap. It and the one that `asks` must hear one another."""
+    def _can_admit(self, other: str, name: str, distance: float) -> bool | None:
+        """Whether `name` is an AV that can stop within `distance` m and has not admitted others too long;
+        None if it accepts a gap itself. Both AVs must receive each other's messages."""
         car = self._fleet.get(name)
-        if not (self._eyes.hears(asks, name) and self._eyes.hears(name, asks)):
+        if not (self._eyes.hears(other, name) and self._eyes.hears(name, other)):
             return False
-        if car is not None and car.goes:
+        if car is not None and car.takes_gap:
             return None
-        if car is None or self._has_let.get(name, 0.0) >= PATIENCE or car.makes_room:
+        if car is None or self._admission_time.get(name, 0.0) >= PATIENCE or car.evading:
             return False
-        needs = sumo.vehicle.getSpeed(name) ** 2 / (2.0 * GENTLY)  # m
-        return bool(needs <= max(before - 2.0 * STOPS_SHORT, 0.0))
+        needed = sumo.vehicle.getSpeed(name) ** 2 / (2.0 * YIELD_DECEL)  # m
+        return bool(needed <= max(distance - 2.0 * STOP_MARGIN, 0.0))
 
-    def _meets_humans(self, name: str) -> bool:
-        """Whether anybody but AVs comes to the junction that it is at, from elsewhere.
+    def _humans_approach(self, name: str) -> bool:
+        """Whether a human approaches the junction ahead of `name` on another edge.
 
-        `getJunctionFoes` leaves out some who have priority.
+        `getJunctionFoes` omits some vehicles with priority.
         """
         get = sumo.vehicle
         own = get.getRoute(name)[max(get.getRouteIndex(name), 0)]
-        if own not in self._ways:
-            self._ways[own] = _ways_beside(own)
-        near, further = self._ways[own]
-        for edges, comes in ((near, True), (further, False)):
+        if own not in self._approaches:
+            self._approaches[own] = _approach_edges(own)
+        near, further = self._approaches[own]
+        for edges, certain in ((near, True), (further, False)):
             for edge in edges:
                 for other in self._eyes.known(name, sumo.edge.getLastStepVehicleIDs(edge)):
                     human = not self._eyes.is_av(name, other, self._fleet)
-                    if human and (comes or near & set(_route_ahead(other))):
+                    if human and (certain or near & set(_route_ahead(other))):
                         return True
         return False
 
 
-def _ways_beside(own: str) -> tuple[frozenset[str], frozenset[str]]:
-    """The edges that lead to the junction at the end of `own`, its inner ones too, but for `own`; and those
-    before them from which it is at most `COMES`."""
+def _approach_edges(own: str) -> tuple[frozenset[str], frozenset[str]]:
+    """The edges that lead to the junction at the end of `own`, without `own` but with internal edges; and the
+    edges before those, up to `APPROACH_RANGE` away."""
     junction = sumo.edge.getToJunction(own)
     near = frozenset(sumo.junction.getIncomingEdges(junction)) - {own}
     further: set[str] = set()
@@ -152,7 +152,7 @@ def _ways_beside(own: str) -> tuple[frozenset[str], frozenset[str]]:
         edge, away = waiting.pop()
         away += float(sumo.lane.getLength(f"{edge}_0"))
         before = sumo.edge.getFromJunction(edge)
-        if away >= COMES or before == junction:
+        if away >= APPROACH_RANGE or before == junction:
             continue
         new = set(sumo.junction.getIncomingEdges(before)) - near - further - {own}
         further |= new
@@ -161,5 +161,5 @@ def _ways_beside(own: str) -> tuple[frozenset[str], frozenset[str]]:
 
 
 def _route_ahead(name: str) -> tuple[str, ...]:
-    """The edges that a vehicle still comes to."""
+    """The remaining edges of a vehicle's route, after the present edge."""
     return tuple(sumo.vehicle.getRoute(name))[max(sumo.vehicle.getRouteIndex(name), 0) + 1 :]

@@ -1,8 +1,8 @@
-"""The gap that an AV takes which has waited long before a line where it must give way.
+"""Gap acceptance of an AV after a long wait at a line where it must give way.
 
-SUMO's driver lets everybody go first who has the right of way over it, he who stands too: he may set off at
-any time. Often he waits himself, until the gap is over. Here who stands has waived it, AVs agree to let one
-in (V2V), and all others must be so far that they need not brake for it.
+SUMO's driver gives way even to a standing vehicle with priority, often until the gap is over. Here a vehicle
+that has stood for a while is taken to yield, and AVs with priority admit the waiting AV (V2V). All other
+vehicles with priority must be far enough away not to brake.
 """
 
 import math
@@ -19,117 +19,117 @@ from cosim.simulation.foes import Foes
 from cosim.simulation.lawful.inside import SPACING, Inside
 from cosim.types import Floats
 
-WITHIN = 200.0  # m before their lines, in which others are looked at
-GENTLY = 1.2  # m/s2: who can stop before his line with less is not asked
-SEEN = 0.5  # m behind its line, where others brake for it
-FASTEST = 20.0  # m/s, limit of their roads: where they drive faster that is too near
-SETS_OFF = 0.5, 2.0  # s until one moves, m/s2 with which it gains speed
-GAINS = 2.0  # m/s2, with which those who drive are taken to gain speed, up to the limit
-MARGIN = 1.5  # s between one and the next at a place that both pass
-MATCHES = 1.5  # m/s2, with which who then follows on its lane may slow down
-BRAKES = 25.0  # m before his line, where who gives way himself brakes
-WAIVES = 2.0  # s for which who stands has stood
-SLOWED = 1.2  # m/s2, with which who lets it in can still stop when it sets off
-HORIZON = 5.0  # s until it can, in which those who let it in are asked
-STOPS = (Rule.STOP, Rule.ALL_WAY_STOP)
+FOE_RANGE = 200.0  # m before its own line, within which a vehicle with priority counts
+COMFORTABLE_DECEL = 1.2  # m/s2: an AV that can stop before its line with less counts as no foe
+VISIBLE_NOSE = 0.5  # m beyond the line, at which others react to the AV
+MAX_FOE_SPEED = 20.0  # m/s, the highest speed limit of a foe's road at which the AV sees the foe in time
+START_DELAY_AND_ACCEL = 0.5, 2.0  # s and m/s2 of an AV that sets off
+MOVING_ACCEL = 2.0  # m/s2 of a moving vehicle, up to its speed limit
+MIN_CONFLICT_GAP = 1.5  # s between two vehicles passing the same conflict point
+MERGE_DECEL = 1.5  # m/s2 by which a foe may slow down behind the merged AV
+YIELD_BRAKING_DISTANCE = 25.0  # m before its own line, where a foe that must yield brakes
+YIELDED_AFTER = 2.0  # s of standing, after which a vehicle with priority is taken to yield
+ADMISSION_DECEL = 1.2  # m/s2 with which an admitting AV must be able to stop when the AV sets off
+ADMISSION_HORIZON = 5.0  # s ahead, within which AVs are asked to admit the AV
+STOP_RULES = (Rule.STOP, Rule.ALL_WAY_STOP)
 
-Met = tuple[float, float, float]  # m behind the lines: own way clear; from where and up to where he is on it
+Conflict = tuple[float, float, float]  # m from the lines: AV past the conflict; foe reaches it, leaves it
 
 
 class Gaps:
-    """The gaps at the lines of `road`, seen with `eyes`; `inside` knows the ways through its junctions."""
+    """Gap acceptance at the lines of `road`, as seen with `eyes`; `inside` gives the paths in junctions."""
 
     def __init__(self, road: RoadMap, inside: Inside, eyes: Eyes) -> None:
         self._road = road
         self._inside = inside
         self._eyes = eyes
-        self._foes = Foes(road, WITHIN, eyes)
+        self._foes = Foes(road, FOE_RANGE, eyes)
 
-    def take(
-        self, name: str, lane: str, via: str, lets: Callable[[str, float], bool | None]
+    def accept(
+        self, name: str, lane: str, via: str, admits: Callable[[str, float], bool | None]
     ) -> tuple[bool, list[str]]:
-        """Whether `name`, which stands on `lane` before a line, can set off now over the lane `via` in the
-        junction; and the AVs that have to let it in, now or soon.
+        """Whether `name`, which stands on `lane` before a line, can set off now over the internal lane
+        `via`; and the AVs that must admit it, now or soon.
 
         Args:
-            lane: also one inside a junction, at whose end the net lets it wait; `via` does not matter then.
-            lets: whether a vehicle, so many m before its line, lets others in; None: it sets off itself.
+            lane: may be internal: the place where vehicles wait inside the junction. Then `via` is ignored.
+            admits: whether a vehicle, so many m before its line, admits others; None: it sets off itself.
         """
-        road, get = self._road, self._eyes.of(name)
+        road, get = self._road, self._eyes.view(name)
         own = road.index.get(lane, -1)
-        link, into = self._ahead(own, road.index.get(via, -1))
+        link, into = self._link_ahead(own, road.index.get(via, -1))
         if link < 0 or self._left_to_sumo(name, link):
             return False, []
         line = road.lanes[own].length - sumo.vehicle.getLanePosition(name)  # m
-        mine = self._inside.through(name, into, 0.0)
-        closed: list[tuple[float, float]] = []  # s from now: from when until when it cannot set off
-        agreed: list[tuple[float, str, bool]] = []  # s: from when on, for whom who lets it in; is he slow
-        first: dict[int, float] = {}  # lane -> m before its line, behind which nobody passes who stays there
-        for before, other, number in self._by_distance(link, name):
+        mine = self._inside.swept_path(name, into, 0.0)
+        blocked: list[tuple[float, float]] = []  # (begin, end) of no entry, s from now
+        admissions: list[tuple[float, str, bool]] = []  # begin in s, admitting AV, whether that AV can stop
+        first: dict[int, float] = {}  # lane -> m before its line of a yielding vehicle, which blocks its lane
+        for before, other, foe in self._foes_by_distance(link, name):
             if before is None:
                 return False, []
-            theirs, speed = road.links[number], get.getSpeed(other)
-            agrees = lets(other, before) if before > 0.0 else None
-            stands = agrees is not None and sumo.vehicle.getWaitingTime(other) > WAIVES
-            if before > first.get(theirs.origin, math.inf) and not _slows(theirs, before):
+            theirs, speed = road.links[foe], get.getSpeed(other)
+            admitted = admits(other, before) if before > 0.0 else None
+            has_yielded = admitted is not None and sumo.vehicle.getWaitingTime(other) > YIELDED_AFTER
+            if before > first.get(theirs.origin, math.inf) and not _yields_ahead(theirs, before):
                 continue
-            met = self._meet(mine, other, number) if agrees or not stands else None
-            if stands or (agrees and met is not None):
+            conflict = self._conflict(mine, other, foe) if admitted or not has_yielded else None
+            if has_yielded or (admitted and conflict is not None):
                 first[theirs.origin] = min(before, first.get(theirs.origin, math.inf))
-            if met is None:
+            if conflict is None:
                 continue
-            begin, end = self._shut(road.links[link], line, number, met, before, speed)
-            if agrees:
-                agreed.append((begin, other, speed**2 <= 2.0 * SLOWED * max(before - 1.0, 0.0)))
+            begin, end = self._blocked_interval(road.links[link], line, foe, conflict, before, speed)
+            if admitted:
+                admissions.append((begin, other, speed**2 <= 2.0 * ADMISSION_DECEL * max(before - 1.0, 0.0)))
             elif end > 0.0:
-                closed.append((begin, end))
+                blocked.append((begin, end))
         start = 0.0
-        for begin, end in sorted(closed):
+        for begin, end in sorted(blocked):
             if begin < start < end:
                 start = end
-        asked = [(other, slow) for begin, other, slow in agreed if begin < start]
-        if start > HORIZON:
+        asked = [(other, can_stop) for begin, other, can_stop in admissions if begin < start]
+        if start > ADMISSION_HORIZON:
             return False, []
-        return start == 0.0 and all(slow for _, slow in asked), [other for other, _ in asked]
+        return start == 0.0 and all(can_stop for _, can_stop in asked), [other for other, _ in asked]
 
-    def brakes(self, name: str, lane: str, via: str, step: float, comes: Callable[[str], bool]) -> float:
-        """m/s2 with which the drivers of those with the right of way would brake at most, if `name` went on
-        from `lane`, on which it nears its line or waits behind it, over the lane `via`. SUMO's
-        drivers stop their `minGap` before the place where the lanes meet.
+    def braking(self, name: str, lane: str, via: str, step: float, is_foe: Callable[[str], bool]) -> float:
+        """The hardest braking (m/s2) that `name` would impose on vehicles with priority, going on
+        now from `lane` over the lane `via`.
+
+        SUMO's drivers stop `minGap` before the place where the lanes meet.
 
         Args:
-            lane: as of `take`.
+            lane, via: as of `accept`.
             step: s of a simulation step.
-            comes: whether a vehicle is one that can be asked.
-        """
-        road, get = self._road, self._eyes.of(name)
+            is_foe: whether a vehicle counts."""
+        road, get = self._road, self._eyes.view(name)
         own = road.index.get(lane, -1)
-        link, into = self._ahead(own, road.index.get(via, -1))
+        link, into = self._link_ahead(own, road.index.get(via, -1))
         if link < 0 or not road.links[link].foes:
             return 0.0
         mine, hardest = None, 0.0
-        away = road.lanes[own].length - get.getLanePosition(name)
-        there = _time(away + SEEN, get.getSpeed(name), GAINS, FASTEST)  # s
-        for other, number in self._foes.of(link, name):
-            if road.links[number].rule in STOPS or not comes(other):  # who stops brakes anyway
+        distance = road.lanes[own].length - get.getLanePosition(name)
+        arrival = _travel_time(distance + VISIBLE_NOSE, get.getSpeed(name), MOVING_ACCEL, MAX_FOE_SPEED)  # s
+        for other, foe in self._foes.find(link, name):
+            if road.links[foe].rule in STOP_RULES or not is_foe(other):  # the foe brakes anyway
                 continue
-            before, speed = self._before(other, number, get), get.getSpeed(other)
-            if before is None or before <= 0.0 or speed**2 <= 2.0 * GENTLY * before:
+            before, speed = self._to_line(other, foe, get), get.getSpeed(other)
+            if before is None or before <= 0.0 or speed**2 <= 2.0 * COMFORTABLE_DECEL * before:
                 continue
             if mine is None:
-                mine = self._inside.through(name, into, 0.0)
-                mine[4] += 2.0 * (road.lanes[into].width - mine[4])  # both as wide as the lanes
-            met = self._meet(mine, other, number)
-            if met is not None:
-                gap = max(before + met[1] - get.getMinGap(other) - there * speed, 0.1)
+                mine = self._inside.swept_path(name, into, 0.0)
+                mine[4] += 2.0 * (road.lanes[into].width - mine[4])  # both as wide as their lanes
+            conflict = self._conflict(mine, other, foe)
+            if conflict is not None:
+                gap = max(before + conflict[1] - get.getMinGap(other) - arrival * speed, 0.1)
                 hardest = max(hardest, (speed - get.getStopSpeed(other, speed, gap)) / step)
         return hardest
 
     # ---- inside ----
 
-    def _ahead(self, own: int, via: int) -> tuple[int, int]:
-        """The link over whose line, or from whose place to wait, one goes on from the lane `own`, and onto
-        which lane; below 0 where there is none."""
+    def _link_ahead(self, own: int, via: int) -> tuple[int, int]:
+        """The next link of a vehicle on lane `own`, over a line or from a waiting place inside a junction,
+        and the lane that the vehicle enters; below 0 where there is none."""
         road = self._road
         if not road.waits_inside(own):
             return road.link_of.get((own, via), -1), via
@@ -137,101 +137,99 @@ class Gaps:
         return link, road.lanes[own].successors[0]
 
     def _left_to_sumo(self, name: str, link: int) -> bool:
-        """Whether there is a signal, or other rules than to give way; whether others drive too fast to be
-        seen in time, or persons are at the junction, whom SUMO's driver looks for on its own way and beside
-        it."""
+        """Whether SUMO's driver decides alone at `link`: at a signal, without a plain yield or stop rule,
+        with foes too fast to be seen in time, or with persons at the junction. Only SUMO's driver checks its
+        whole way for persons."""
         lanes, links = self._road.lanes, self._road.links
         if links[link].signal >= 0 or links[link].rule not in (Rule.YIELD, Rule.STOP):
             return True
-        if any(lanes[links[foe].origin].speed_limit > FASTEST for foe in links[link].foes):
+        if any(lanes[links[foe].origin].speed_limit > MAX_FOE_SPEED for foe in links[link].foes):
             return True
-        return any(True for _ in self._inside.walkers(name, lanes[links[link].via].start, 0.0))
+        return any(True for _ in self._inside.persons(name, lanes[links[link].via].start, 0.0))
 
-    def _by_distance(self, link: int, name: str) -> Iterator[tuple[float | None, str, int]]:
-        """Those with the right of way over a link: m before their line (below 0: beyond it; None: not
-        known), who, and by which link; the nearest first."""
-        get = self._eyes.of(name)
-        found = [
-            (self._before(other, number, get), other, number) for other, number in self._foes.of(link, name)
-        ]
-        yield from sorted(found, key=lambda foe: -math.inf if foe[0] is None else foe[0])
+    def _foes_by_distance(self, link: int, name: str) -> Iterator[tuple[float | None, str, int]]:
+        """The vehicles with priority over a link, nearest first: m before their line (below 0: beyond it;
+        None: unknown), id, and link."""
+        get = self._eyes.view(name)
+        found = [(self._to_line(other, foe, get), other, foe) for other, foe in self._foes.find(link, name)]
+        yield from sorted(found, key=lambda entry: -math.inf if entry[0] is None else entry[0])
 
-    def _meet(self, mine: Floats, other: str, number: int) -> Met | None:
-        """Where who drives `mine` ([5,k], of `Inside.through`) and `other` meet; None where they do not."""
-        theirs = self._inside.through(other, self._road.links[number].via, 0.0)
-        met = overlap(Boxes(*mine[:, :, None]), Boxes(*theirs[:, None, :]))  # [places, places]
-        places, others = np.flatnonzero(met.any(1)), np.flatnonzero(met.any(0))
+    def _conflict(self, mine: Floats, other: str, foe: int) -> Conflict | None:
+        """Where the path `mine` ([5,k], of `Inside.swept_path`) meets that of `other`; None: nowhere."""
+        theirs = self._inside.swept_path(other, self._road.links[foe].via, 0.0)
+        conflict = overlap(Boxes(*mine[:, :, None]), Boxes(*theirs[:, None, :]))  # [places, places]
+        places, others = np.flatnonzero(conflict.any(1)), np.flatnonzero(conflict.any(0))
         if not len(places):
             return None
         return float(places[-1] + 1) * SPACING, float(others[0]) * SPACING, float(others[-1]) * SPACING
 
-    def _shut(
-        self, mine: Link, line: float, number: int, met: Met, before: float, speed: float
+    def _blocked_interval(
+        self, mine: Link, line: float, foe: int, conflict: Conflict, before: float, speed: float
     ) -> tuple[float, float]:
-        """s from now, from when until when one who is `line` m before its line cannot set off for who drives
-        `speed` m/s `before` m before the line of the link `number`."""
-        lanes, theirs = self._road.lanes, self._road.links[number]
-        clear, reach, gone = met
-        (wait, gains), turns = SETS_OFF, lanes[mine.via].speed_limit
-        most = max(speed, lanes[theirs.origin].speed_limit)
-        if before > 0.0 and theirs.rule in STOPS:
-            there = before / max(speed, 0.1) + wait + _time(reach, 0.0, GAINS, most)
-        elif _slows(theirs, before):
-            there = _time(before - BRAKES, speed, GAINS, most)
+        """(begin, end) in s from now: a vehicle `line` m before its line cannot set off then, because of
+        a foe at `speed` m/s, `before` m before the line of the link `foe`."""
+        lanes, theirs = self._road.lanes, self._road.links[foe]
+        clear, reach, leave = conflict
+        (delay, accel), turn_speed = START_DELAY_AND_ACCEL, lanes[mine.via].speed_limit
+        max_speed = max(speed, lanes[theirs.origin].speed_limit)
+        if before > 0.0 and theirs.rule in STOP_RULES:
+            arrival = before / max(speed, 0.1) + delay + _travel_time(reach, 0.0, MOVING_ACCEL, max_speed)
+        elif _yields_ahead(theirs, before):
+            arrival = _travel_time(before - YIELD_BRAKING_DISTANCE, speed, MOVING_ACCEL, max_speed)
         else:
-            there = _time(before + reach, speed, GAINS, most)
+            arrival = _travel_time(before + reach, speed, MOVING_ACCEL, max_speed)
         if theirs.target == mine.target:
-            slower = max(most - min(math.sqrt(2.0 * gains * (line + clear)), turns), 0.0)  # m/s
-            there -= slower**2 / (2.0 * MATCHES) / most
-        passes = wait + _time(line + clear, 0.0, gains, turns)
-        return there - passes - MARGIN, (before + gone) / max(speed, 1.0)
+            slower = max(max_speed - min(math.sqrt(2.0 * accel * (line + clear)), turn_speed), 0.0)  # m/s
+            arrival -= slower**2 / (2.0 * MERGE_DECEL) / max_speed
+        clearing = delay + _travel_time(line + clear, 0.0, accel, turn_speed)
+        return arrival - clearing - MIN_CONFLICT_GAP, (before + leave) / max(speed, 1.0)
 
-    def _before(self, name: str, number: int, get: Any) -> float | None:
-        """m that a vehicle is before the line of the link `number`; below 0: beyond it. None: not known.
+    def _to_line(self, name: str, foe: int, get: Any) -> float | None:
+        """m from a vehicle to the line of the link `foe`; below 0: beyond it; None: unknown.
 
-        `get`: of `Eyes.of`.
+        `get`: of `Eyes.view`.
         """
         road = self._road
         lane, at = road.index.get(get.getLaneID(name), -1), get.getLanePosition(name)
         if lane < 0:
             return None
         beyond = 0.0
-        for inside in road.inside[number]:
+        for inside in road.inside[foe]:
             if inside == lane:
                 return -float(beyond + at)
             beyond += road.lanes[inside].length
         away = float(road.lanes[lane].length - at)
         if get is not sumo.vehicle and road.lanes[lane].id != sumo.vehicle.getLaneID(name):
-            return self._straight(lane, away, number)  # the links ahead of where it is are not the ones
-        while road.lanes[lane].internal:  # `getNextLinks` begins at the end of the lane that it comes out on
+            return self._straight_on(lane, away, foe)  # SUMO's links are those of the true lane
+        while road.lanes[lane].internal:  # `getNextLinks` starts at the end of the next normal lane
             lane = next(iter(road.lanes[lane].successors), -1)
             if lane < 0:
                 return None
             away += road.lanes[lane].length
         for following, _, _, _, via, *_, length in get.getNextLinks(name):
-            if via and road.index.get(via, -1) == road.links[number].via:
+            if via and road.index.get(via, -1) == road.links[foe].via:
                 return away
             away += float(length + sumo.lane.getLength(following))
         return None
 
-    def _straight(self, lane: int, away: float, number: int) -> float | None:
-        """`_before` of one that is `away` m before the end of `lane` and drives on straight."""
+    def _straight_on(self, lane: int, away: float, foe: int) -> float | None:
+        """`_to_line` of a vehicle `away` m before the end of `lane` that drives straight on."""
         following, length = self._road.straight_on
-        while away < WITHIN and (lane := int(following[lane])) >= 0:
-            if lane == self._road.links[number].via:
+        while away < FOE_RANGE and (lane := int(following[lane])) >= 0:
+            if lane == self._road.links[foe].via:
                 return away
             away += float(length[lane])
         return None
 
 
-def _slows(link: Link, before: float) -> bool:
-    """Whether who is so many m before the line of `link` brakes there, to give way, without stopping."""
-    return before > 0.0 and bool(link.foes) and link.rule not in STOPS
+def _yields_ahead(link: Link, before: float) -> bool:
+    """Whether a vehicle `before` m before the line of `link` brakes there to give way, without a stop."""
+    return before > 0.0 and bool(link.foes) and link.rule not in STOP_RULES
 
 
-def _time(way: float, speed: float, gains: float, most: float) -> float:
-    """s for `way` m from `speed` m/s on, gaining `gains` m/s2 up to `most` m/s; 0 for none."""
-    way, until = max(way, 0.0), (most**2 - speed**2) / (2.0 * gains)
-    if way <= until:
-        return (math.sqrt(speed**2 + 2.0 * gains * way) - speed) / gains
-    return (most - speed) / gains + (way - until) / most
+def _travel_time(distance: float, speed: float, accel: float, max_speed: float) -> float:
+    """s to drive `distance` m from `speed` m/s at `accel` m/s2 up to `max_speed` m/s; 0 below 0 m."""
+    distance, accel_distance = max(distance, 0.0), (max_speed**2 - speed**2) / (2.0 * accel)
+    if distance <= accel_distance:
+        return (math.sqrt(speed**2 + 2.0 * accel * distance) - speed) / accel
+    return (max_speed - speed) / accel + (distance - accel_distance) / max_speed

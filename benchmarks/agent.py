@@ -39,7 +39,7 @@ from cosim.workers.worker import Worker
 from policy.agents.approaches import AgentConfig, compact, paper
 from policy.agents.prediction_aware import PredictionAware
 from policy.training.config import agent_config
-from policy.training.curriculum import Drive, Drove, Lesson
+from policy.training.curriculum import Drive, DriveResult, Lesson
 from policy.training.ddqn import DdqnLearner
 from policy.training.replay_buffer import ReplayBuffer
 
@@ -137,7 +137,7 @@ def training(config: str, lesson: Lesson, episodes: int) -> dict[str, float]:
             learner.update(replay.sample(rng))
             updates += 1
         elapsed = time.perf_counter() - began
-        drove: list[Drove] = [future.result() for future in waiting]
+        drove: list[DriveResult] = [future.result() for future in waiting]
     steps = sum(figure(one, "steps") for one in drove)
     whole = file.training.iterations * file.training.episodes
     return {
@@ -154,7 +154,7 @@ def training(config: str, lesson: Lesson, episodes: int) -> dict[str, float]:
     }
 
 
-def figure(one: Drove, name: str) -> float:
+def figure(one: DriveResult, name: str) -> float:
     """A figure that every drive has."""
     value = one.figures[name]
     assert value is not None

@@ -32,7 +32,7 @@ from cosim.workers.progress import Progress
 from research import kept
 from research.schema import Claim, Condition
 
-LEAST = 2  # episodes, however small the scale
+MIN_EPISODES = 2  # episodes, however small the scale
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Settings:
     def seeds_of(self, claim: Claim, scenario: str) -> range:
         """The seeds of every arm in a scenario, fewer at a small scale."""
         seeds = claim.seeds_of(scenario) if self.seeds is None else self.seeds
-        return seeds[: max(round(len(seeds) * self.scale), LEAST)]
+        return seeds[: max(round(len(seeds) * self.scale), MIN_EPISODES)]
 
     def conditions(self, claim: Claim) -> list[Condition]:
         """Those of the scenarios that are wanted."""

@@ -13,7 +13,7 @@ from markdown.preprocessors import Preprocessor
 from cosim.cli import COMMANDS
 from cosim.cli.main import parser
 
-PLACE = "[command-line]"  # the line of a page that the commands replace
+PLACEHOLDER = "[command-line]"  # the line of a page that the commands replace
 
 
 def commands() -> list[str]:
@@ -73,9 +73,9 @@ def _text(text: str) -> str:
 
 class _CommandLine(Preprocessor):
     def run(self, lines: list[str]) -> list[str]:
-        if PLACE not in lines:
+        if PLACEHOLDER not in lines:
             return lines
-        at = lines.index(PLACE)
+        at = lines.index(PLACEHOLDER)
         return [*lines[:at], *commands(), *lines[at + 1 :]]
 
 

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 from cosim.workers.supervisor import Factory, Limits, Supervisor
 from cosim.workers.tasks import Outcome, Task, TaskQueue
 
-ENDING = 10.0  # s that a worker may take to end
+STOP_TIMEOUT = 10.0  # s that a worker may take to end
 
 
 class Engine(Protocol):
@@ -75,14 +75,14 @@ class LocalEngine:
                     raise outcome
                 yield outcome
             for thread in threads:
-                thread.join(timeout=ENDING)
+                thread.join(timeout=STOP_TIMEOUT)
         finally:
             stopped.set()
             waiting = [(s, t) for s, t in zip(supervisors, threads, strict=True) if t.is_alive()]
             for supervisor, _ in waiting:
                 supervisor.kill()
             for _, thread in waiting:
-                thread.join(timeout=ENDING)
+                thread.join(timeout=STOP_TIMEOUT)
 
 
 def cores() -> int:

@@ -8,11 +8,11 @@ import time
 from collections.abc import Generator, Sequence
 from typing import Any
 
-from cosim.workers.engines import ENDING, cores
+from cosim.workers.engines import STOP_TIMEOUT, cores
 from cosim.workers.supervisor import Factory, Limits, Supervisor
 from cosim.workers.tasks import Outcome, Task, TaskQueue
 
-TURN = 10.0  # s that a process stays with one batch while another one has none
+MIN_TURN = 10.0  # s that a process stays with one batch while another one has none
 
 
 class Cancelled(Exception):
@@ -59,7 +59,7 @@ class Pool:
         for seat in self._seats:
             seat.kill()
         for seat in self._seats:
-            seat.thread.join(timeout=ENDING)
+            seat.thread.join(timeout=STOP_TIMEOUT)
 
     # ---- for the engines and the seats ----
 
@@ -86,7 +86,7 @@ class Pool:
             while not self._closed:
                 crowd = {id(b): sum(s.batch is b for s in self._seats) for b in self._batches}
                 choice = sorted(self._batches, key=lambda b: crowd[id(b)])
-                turn_is_over = time.monotonic() - seat.since > TURN and 0 in crowd.values()
+                turn_is_over = time.monotonic() - seat.since > MIN_TURN and 0 in crowd.values()
                 if seat.last in choice and not turn_is_over:
                     choice.insert(0, seat.last)
                 for batch in choice:

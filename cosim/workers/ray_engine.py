@@ -18,9 +18,9 @@ from cosim.workers.pool import Cancelled
 from cosim.workers.supervisor import Factory, Limits, Supervisor
 from cosim.workers.tasks import SIM_CRASH, Outcome, Task, TaskQueue
 
-LOSSES = 6  # actors that may be lost at one task: as often as a process may be killed at it
-LOOK_EVERY = 0.5  # s between looks whether the run was cancelled
-NOTICE_AFTER = 30.0  # s without any running actor before a note is printed
+MAX_LOSSES = 6  # actors that may be lost at one task: as often as a process may be killed at it
+POLL_INTERVAL = 0.5  # s between looks whether the run was cancelled
+NOTICE_DELAY = 30.0  # s without any running actor before a note is printed
 _CONNECTING = threading.Lock()
 
 
@@ -137,12 +137,12 @@ class _Actors:
             self._start_actor()
         heard = time.monotonic()
         while left:
-            ready, _ = self._ray.wait(list(self._calls), num_returns=1, timeout=LOOK_EVERY)
+            ready, _ = self._ray.wait(list(self._calls), num_returns=1, timeout=POLL_INTERVAL)
             if self._cancelled.is_set():
                 raise Cancelled
             if ready:
                 heard = time.monotonic()
-            elif time.monotonic() - heard > NOTICE_AFTER:
+            elif time.monotonic() - heard > NOTICE_DELAY:
                 heard = time.monotonic()
                 if all(task is None for _, task, _ in self._calls.values()):
                     print("cosim: waiting for the Ray cluster to offer a core", file=sys.stderr, flush=True)
@@ -184,12 +184,12 @@ class _Actors:
     def _lost(self, task: Task, error: Exception, tasks_left: TaskQueue) -> Outcome | None:
         """The task of a lost actor goes back, unless too many were lost at it."""
         self._losses[task.key] += 1
-        if self._losses[task.key] < LOSSES:
+        if self._losses[task.key] < MAX_LOSSES:
             tasks_left.put_back(task)
             return None
         words = " ".join(str(error).split())[:500]
-        problem = f"{LOSSES} Ray workers were lost at it: {words}"
-        return Outcome(task.key, SIM_CRASH, error=problem, attempts=LOSSES)
+        problem = f"{MAX_LOSSES} Ray workers were lost at it: {words}"
+        return Outcome(task.key, SIM_CRASH, error=problem, attempts=MAX_LOSSES)
 
 
 class _Actor:

@@ -165,7 +165,7 @@ class Worker(contextlib.AbstractContextManager["Worker"]):
         if not self._untrusted:
             return self._pipe.recv()  # type: ignore[no-any-return]
         try:
-            kind, value = untrusted.load(self._pipe.recv_bytes(untrusted.LARGEST))
+            kind, value = untrusted.load(self._pipe.recv_bytes(untrusted.MAX_ANSWER))
             if kind in ("value", "progress") or isinstance(value, CosimError):
                 return kind, value
         except (EOFError, ConnectionResetError):

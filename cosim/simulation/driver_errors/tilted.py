@@ -6,7 +6,7 @@ import numpy as np
 
 from cosim.scenario.tilt import Tilt, case, log_ratio
 from cosim.simulation.backend import sumo
-from cosim.types import REMEMBERED, Bools
+from cosim.types import ERROR_MEMORY, Bools
 
 TILT_RADIUS = 60.0  # m: within that of an AV errors may be tilted
 MAX_TILTED_ERRORS = 2  # errors from raised probabilities in an episode
@@ -41,7 +41,7 @@ class Tilted:
     ) -> None:
         """Before the trials of a second. `erring`: drivers who err; `ended`: s, when earlier errors ended."""
         if self._tilt is not None and self._begun < MAX_TILTED_ERRORS:
-            recent = {who for who, end in ended.items() if now - end <= REMEMBERED}
+            recent = {who for who, end in ended.items() if now - end <= ERROR_MEMORY}
             known = [name for name in names if name in erring or name in recent]
             self._near, self._during = _beside_avs(names, avs, known)
 

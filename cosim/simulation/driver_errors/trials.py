@@ -18,7 +18,7 @@ from cosim.simulation.driver_errors.kind import ErrorKind, UnderWay
 from cosim.simulation.driver_errors.surroundings import Surroundings, leader
 from cosim.simulation.driver_errors.tilted import Tilted
 from cosim.simulation.drivers import Drivers
-from cosim.types import REMEMBERED, Collision, HumanError, Kind
+from cosim.types import ERROR_MEMORY, Collision, HumanError, Kind
 
 # In the order of their trials: those of every second, then those of manoeuvres, then those of persons.
 KINDS: tuple[type[ErrorKind], ...] = (
@@ -202,6 +202,6 @@ class HumanErrors:
         now = collision.time
         pair = [collision.collider, collision.victim]
         return any(
-            who in self._under_way or now - self._ended.get(who, -math.inf) <= REMEMBERED
+            who in self._under_way or now - self._ended.get(who, -math.inf) <= ERROR_MEMORY
             for who in (*pair, *filter(None, map(leader, pair)))
         )

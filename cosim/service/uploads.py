@@ -1,4 +1,4 @@
-"""What users send: archives of a scenario or of weights, unpacked with limits, examined, kept."""
+"""Uploads of users: archives of a scenario or of weights, unpacked with limits, examined, stored."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from research import audit, drive, evaluate, index, kept, page, schema
 from research.drive import Settings
 from research.schema import Claim
 
-SAMPLE = 20  # episodes that `audit` drives anew
+SAMPLE = 20  # episodes of `audit`
 STALE, INTERRUPTED = 1, 130  # exit codes
 
 

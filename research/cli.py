@@ -102,7 +102,7 @@ COMMANDS = {"list": _list, "drive": _drive, "page": _page, "check": _check, "kee
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Flags that say how much is driven, by whom, and where it lies."""
+    """Flags for amount, engine and folders of the drives."""
     add, default = parser.add_argument, Settings()
     add("--workers", type=int, default=default.workers, metavar="N")
     add("--engine", choices=("local", "ray"), default=default.engine)

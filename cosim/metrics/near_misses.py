@@ -79,8 +79,8 @@ class NearMisses:
         with_av = sum(meeting.with_av for meeting in found)
         counts = {"": (len(found), self._vehicles), "av_": (with_av, self._avs)}
         return {
-            f"{who}near_misses_{self._measure}": Metric(count if seen else None, "encounters", "lower")
-            for who, (count, seen) in counts.items()
+            f"{prefix}near_misses_{self._measure}": Metric(count if seen else None, "encounters", "lower")
+            for prefix, (count, seen) in counts.items()
         }
 
 

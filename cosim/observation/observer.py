@@ -162,7 +162,7 @@ class Observer:
     def _moment(self, s: Snapshot, seen: Bools) -> Moment:
         """The signals, the changed limits, and the persons among the `seen` [n] (with V2V: perceived by any
         AV)."""
-        who = np.flatnonzero((s.kind == int(Kind.PERSON)) & seen)
-        persons = np.stack([s.x, s.y, s.heading, s.speed], axis=1)[who] if len(who) else None
+        chosen = np.flatnonzero((s.kind == int(Kind.PERSON)) & seen)
+        persons = np.stack([s.x, s.y, s.heading, s.speed], axis=1)[chosen] if len(chosen) else None
         told = self._config.signal_timing and len(s.switches)
         return Moment(s.signals, s.switches if told else None, persons, s.limits)

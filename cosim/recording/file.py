@@ -68,10 +68,10 @@ class Recording:
         before: npt.NDArray[np.int32] = np.zeros(0, np.int32)
         for k, time in enumerate(self.times):
             rows = order[cuts[k] : cuts[k + 1]]
-            who = t["vehicle"][rows]
+            present = t["vehicle"][rows]
             numbers: dict[str, Any] = {name: t[name][rows].astype(np.float64) for name in REAL}
-            if not np.array_equal(who, before):  # the same tuple while the set of vehicles is unchanged
-                names, before = tuple([self.ids[i] for i in who]), who
+            if not np.array_equal(present, before):  # the same tuple while the set of vehicles is unchanged
+                names, before = tuple([self.ids[i] for i in present]), present
             frames.append(
                 Snapshot(
                     time=float(time),

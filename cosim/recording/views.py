@@ -87,21 +87,21 @@ def windows(
     parts = []
     for k in range(recording.first, len(recording.times) - 1, every):
         here = t.state[:, k]  # [V,4]
-        who = np.flatnonzero(np.isfinite(here[:, 0]))
+        chosen = np.flatnonzero(np.isfinite(here[:, 0]))
         if perceived is not None:
-            avs = here[who[t.is_av[who]]]
-            gap2 = ((here[who, None, :2] - avs[None, :, :2]) ** 2).sum(2)
-            who = who[(gap2 <= perceived**2).any(1)]
+            avs = here[chosen[t.is_av[chosen]]]
+            gap2 = ((here[chosen, None, :2] - avs[None, :, :2]) ** 2).sum(2)
+            chosen = chosen[(gap2 <= perceived**2).any(1)]
         at = k + frames  # of frame k in `padded`
         parts.append(
             Windows(
-                padded[who, at - frames + 1 : at + 1],
-                padded[who, at + 1 : at + 1 + horizon],
-                t.lane[who, k],
-                t.lane_position[who, k],
-                t.length[who],
-                t.is_av[who],
-                np.full(len(who), k),
+                padded[chosen, at - frames + 1 : at + 1],
+                padded[chosen, at + 1 : at + 1 + horizon],
+                t.lane[chosen, k],
+                t.lane_position[chosen, k],
+                t.length[chosen],
+                t.is_av[chosen],
+                np.full(len(chosen), k),
             )
         )
     return Windows(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))

@@ -1,7 +1,7 @@
 """Exclusive ownership of a PostgreSQL database's runs: one server at a time, across reconnections.
 
-A lock of PostgreSQL's says who may drive; it is gone as soon as the connection is that took it. The row of
-`cosim_claim` names the last server that held it: whoever writes as another one is refused.
+A PostgreSQL lock, released with its connection, permits driving. The row of `cosim_claim` names the last
+server that held the lock; writes of another server are refused.
 """
 
 from __future__ import annotations

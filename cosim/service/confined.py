@@ -5,7 +5,7 @@ resources are limited, and root is not root in it. It is started without the ser
 answers is read as plain data (`cosim.workers.untrusted`).
 
 Nothing of the simulation is imported before the process is confined: numba settles on its cache when it is
-imported, and gets a copy of its own, which nobody else ever reads.
+imported, and gets its own copy, which no other process reads.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Who watches a session and what they are sent; the session as their pages ask it to be driven.
+"""Viewers of a session, their messages, and driving on request of their pages.
 
-A page asks for the simulation to be driven up to some moment, and asks again as its own clock comes near: so
-a page that pauses, is slow or gone drives nothing. Whoever else drives the session is never kept waiting: of
-what a slow page has not fetched, the oldest steps are dropped.
+A page requests driving up to some moment, and requests more as its own clock approaches that moment. A page
+that pauses, is slow or gone therefore drives nothing. Other drivers of the session never wait: for a slow
+page the oldest unsent steps are dropped.
 """
 
 from __future__ import annotations

@@ -19,9 +19,9 @@ def droppable() -> bool:
 
 
 def drop(folders: Iterable[str]) -> None:
-    """Give up every capability; root becomes NOBODY, to whom `folders` then belong.
+    """Give up every capability; root becomes NOBODY, the new owner of `folders`.
 
-    What was root keeps the one to read and to enter folders (of those that it has): Landlock says which.
+    A former root keeps the capability to read and enter folders, if it had it; Landlock restricts them.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     ended_by = ctypes.c_int()

@@ -150,9 +150,9 @@ def _rendered(
     raster.show(scene.histories[0].signals)  # present signal states: their future is unknown
     c = observation
     corner = 0.5 * float(np.hypot(c.height * c.metres_across, c.width * c.metres_along))  # m
-    rows, known, who = pictured(scene, x, y, speed, heading, corner + 1.0)
+    rows, known, index = pictured(scene, x, y, speed, heading, corner + 1.0)
     if corrected is not None:
-        share = corrected.share(who)[..., : states[0].shape[1]][..., wanted]  # [B,k,M]
+        share = corrected.share(index)[..., : states[0].shape[1]][..., wanted]  # [B,k,M]
         rows = shade(rows, share.transpose(0, 2, 1))
     return render(rows, known, scene.pose, observation, raster)
 

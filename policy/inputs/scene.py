@@ -103,12 +103,12 @@ def rows_ahead(scene: Scene, x: Floats, y: Floats, speed: Floats, heading: Float
     Returns rows [B,M,R,8] in each ego's frame at the newest frame (m, m/s, rad) and their validity [B,R].
     """
     known = (scene.row >= 0) & scene.valid[np.maximum(scene.row, 0), -1]  # [B,R]
-    who = np.maximum(scene.row, 0)
+    index = np.maximum(scene.row, 0)
     # headings continue the vehicle's history row: the same multiple of 2 pi
     base = (
-        np.stack([h.kinematics[-1, :, HEADING] for h in scene.histories]) - scene.state[who, -1, HEADING]
+        np.stack([h.kinematics[-1, :, HEADING] for h in scene.histories]) - scene.state[index, -1, HEADING]
     )  # [B,R]
-    return _rows(scene, who, known, base, (x, y, speed, heading)), known
+    return _rows(scene, index, known, base, (x, y, speed, heading)), known
 
 
 def pictured(
@@ -126,9 +126,9 @@ def pictured(
         for mine, row in zip(owned, scene.row, strict=True):
             mine[row[row >= 0]] = True
     size = scene.state[:, -1, LENGTH] + scene.state[:, -1, WIDTH]
-    who, known = _near(scene.ego, scene.valid[:, -1], owned, x, y, size, reach)
-    base = np.repeat(-scene.pose[:, 2:3], who.shape[1], 1)
-    return _rows(scene, who, known, base, (x, y, speed, heading)), known, who
+    index, known = _near(scene.ego, scene.valid[:, -1], owned, x, y, size, reach)
+    base = np.repeat(-scene.pose[:, 2:3], index.shape[1], 1)
+    return _rows(scene, index, known, base, (x, y, speed, heading)), known, index
 
 
 @compiled
@@ -143,11 +143,11 @@ def _near(
 ) -> tuple[Ints, Bools]:
     """Vehicles drawn for each ego [B,k], the ego first, padded with 0, and their validity [B,k]."""
     count, vehicles, frames = ego.shape[0], x.shape[0], x.shape[1]
-    who, known = np.zeros((count, vehicles), np.int64), np.zeros((count, vehicles), np.bool_)
+    index, known = np.zeros((count, vehicles), np.int64), np.zeros((count, vehicles), np.bool_)
     most = 1
     for b in range(count):
         e, n = ego[b], 1
-        who[b, 0], known[b, 0] = e, valid[e]
+        index[b, 0], known[b, 0] = e, valid[e]
         for j in range(1, vehicles):
             v = 0 if j == e else j  # the ego and the first vehicle swap places
             if not valid[v] or (owned.shape[1] > 1 and not owned[b, v]):
@@ -155,26 +155,26 @@ def _near(
             limit = (reach + size[v]) ** 2
             for k in range(frames):
                 if not (x[v, k] - x[e, k]) ** 2 + (y[v, k] - y[e, k]) ** 2 > limit:  # true for nan too
-                    who[b, n], known[b, n] = v, True
+                    index[b, n], known[b, n] = v, True
                     n += 1
                     break
         most = max(most, n)
-    return who[:, :most].copy(), known[:, :most].copy()
+    return index[:, :most].copy(), known[:, :most].copy()
 
 
 def _rows(
-    scene: Scene, who: Ints, known: Bools, base: Floats, states: tuple[Floats, Floats, Floats, Floats]
+    scene: Scene, index: Ints, known: Bools, base: Floats, states: tuple[Floats, Floats, Floats, Floats]
 ) -> Floats:
-    """[B,M,k,8] of the vehicles `who` [B,k]; `base` [B,k] rad is added to their headings."""
+    """[B,M,k,8] of the vehicles `index` [B,k]; `base` [B,k] rad is added to their headings."""
     x, y, speed, heading = states
-    rows = np.zeros((len(who), x.shape[1], who.shape[1], len(KINEMATIC_FEATURES)))
-    dx = x[who] - scene.pose[:, 0, None, None]  # [B,k,M]
-    dy = y[who] - scene.pose[:, 1, None, None]
+    rows = np.zeros((len(index), x.shape[1], index.shape[1], len(KINEMATIC_FEATURES)))
+    dx = x[index] - scene.pose[:, 0, None, None]  # [B,k,M]
+    dy = y[index] - scene.pose[:, 1, None, None]
     c, s = np.cos(scene.pose[:, 2])[:, None, None], np.sin(scene.pose[:, 2])[:, None, None]
     rows[..., X] = (c * dx + s * dy).transpose(0, 2, 1)
     rows[..., Y] = (c * dy - s * dx).transpose(0, 2, 1)
-    rows[..., SPEED] = speed[who].transpose(0, 2, 1)
-    rows[..., HEADING] = (heading[who] + base[..., None]).transpose(0, 2, 1)
-    rows[..., 4:] = scene.state[who, -1, 4:][:, None]
+    rows[..., SPEED] = speed[index].transpose(0, 2, 1)
+    rows[..., HEADING] = (heading[index] + base[..., None]).transpose(0, 2, 1)
+    rows[..., 4:] = scene.state[index, -1, 4:][:, None]
     rows *= known[:, None, :, None]
     return rows

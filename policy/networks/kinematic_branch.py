@@ -119,9 +119,9 @@ class Corrected(NamedTuple):
     seen: Floats32  # [V,M] logits of `confidence`
     looking: Floats32  # [V,M]
 
-    def share(self, who: Ints) -> Floats:
-        """[B,k,M] `confidence` of the vehicles `who` [B,k] in the picture of each AV, the AV itself first."""
-        logit = self.seen[who] + self.looking[who[:, 0]][:, None] + 4.0
+    def share(self, index: Ints) -> Floats:
+        """[B,k,M] `confidence` of the vehicles `index` [B,k] in each AV's picture, the AV itself first."""
+        logit = self.seen[index] + self.looking[index[:, 0]][:, None] + 4.0
         out: Floats = 1.0 / (1.0 + np.exp(-logit.astype(np.float64)))
         out[:, 0] = 1.0  # an AV is at the centre of its own picture by definition
         return out

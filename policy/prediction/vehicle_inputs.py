@@ -141,7 +141,7 @@ def _leaders(scene: Scene, traffic: Traffic, now: Floats, accel: Floats, known: 
     begins = np.concatenate([p.lane_start for p in paths]) if paths else np.zeros(0)
     scale = np.array([1.0 if p is None else p.scale for p in traffic.stream])
     place = np.where(known, scene.lane, -2).astype(np.int64)
-    who, gap = _next_on_path(
+    leader, gap = _next_on_path(
         start,
         lanes,
         begins,
@@ -152,10 +152,10 @@ def _leaders(scene: Scene, traffic: Traffic, now: Floats, accel: Floats, known: 
         now[:, LENGTH],
         traffic.rollout.arc[:, 0],
     )
-    there = who >= 0
-    j = np.maximum(who, 0)
+    there = leader >= 0
+    j = np.maximum(leader, 0)
     parts = (
-        np.ones(who.shape),
+        np.ones(leader.shape),
         np.exp(-np.maximum(gap, 0.0) / 20.0),
         now[j, SPEED] / 30.0,
         (now[:, None, SPEED] - now[j, SPEED]) / 8.0,
@@ -178,7 +178,7 @@ def _next_on_path(
 ) -> tuple[Ints, Floats]:
     """The nearest two vehicles ahead on every path [V,2] (-1: none) and the gaps to them [V,2] m."""
     count = place.shape[0]
-    who, gap = np.full((count, 2), -1), np.full((count, 2), np.inf)
+    leader, gap = np.full((count, 2), -1), np.full((count, 2), np.inf)
     for i in range(count):
         for k in range(start[i], start[i + 1]):
             if begins[k] > front[i] + 150.0:
@@ -190,11 +190,11 @@ def _next_on_path(
                 if ahead < -3.0 or ahead > 150.0 or ahead >= gap[i, 1]:
                     continue
                 if ahead < gap[i, 0]:
-                    gap[i, 1], who[i, 1] = gap[i, 0], who[i, 0]
-                    gap[i, 0], who[i, 0] = ahead, j
+                    gap[i, 1], leader[i, 1] = gap[i, 0], leader[i, 0]
+                    gap[i, 0], leader[i, 0] = ahead, j
                 else:
-                    gap[i, 1], who[i, 1] = ahead, j
-    return who, gap
+                    gap[i, 1], leader[i, 1] = ahead, j
+    return leader, gap
 
 
 def _near(scene: Scene, now: Floats, accel: Floats, lane: Floats, known: Bools) -> Floats32:

@@ -196,7 +196,7 @@ def gap_margin(
     """
     speeds = np.asarray(others.boxes.speed)
     soon = speeds[:, min(round(c.reaction / c.dt), speeds.shape[1] - 1)]
-    ratio, who = _tightest(
+    ratio, tightest = _tightest(
         stopping,
         speed,
         changes,
@@ -211,7 +211,7 @@ def gap_margin(
         c.follower_reaction,
         c.follower_brake,
     )
-    return np.where(ratio >= 1.0, np.inf, 0.999 * c.safe_th * np.maximum(ratio, 0.0)), who
+    return np.where(ratio >= 1.0, np.inf, 0.999 * c.safe_th * np.maximum(ratio, 0.0)), tightest
 
 
 _DECELERATE = int(MetaAction.DECELERATE)
@@ -238,7 +238,7 @@ def _tightest(
 ) -> tuple[Floats, Ints]:
     """Smallest ratio of actual to required gap [A], and the limiting vehicle [A]; see `gap_margin`."""
     actions, count = gap.shape
-    best, who = np.full(actions, np.inf), np.zeros(actions, np.int64)
+    best, tightest = np.full(actions, np.inf), np.zeros(actions, np.int64)
     for a in range(actions):
         for k in range(count):
             ratio = np.inf
@@ -256,5 +256,5 @@ def _tightest(
                 if in_lane[a, k] and gap[a, k] < standstill_gap:
                     ratio = 0.0
             if ratio < best[a]:
-                best[a], who[a] = ratio, k
-    return best, who
+                best[a], tightest[a] = ratio, k
+    return best, tightest

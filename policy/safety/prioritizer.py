@@ -194,8 +194,8 @@ def evaluate(
             forbidden = REFUSED
         if forbidden is not None:
             unsafe[a], score[a], blamed[a] = True, -1.0, forbidden
-    who = tuple(name if bad else None for name, bad in zip(blamed, unsafe, strict=True))
-    return Evaluation(np.minimum(contact, c.cap), score, unsafe, who, futures)
+    reasons = tuple(name if bad else None for name, bad in zip(blamed, unsafe, strict=True))
+    return Evaluation(np.minimum(contact, c.cap), score, unsafe, reasons, futures)
 
 
 def _contacts(

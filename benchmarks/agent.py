@@ -38,7 +38,7 @@ from cosim.workers.worker import Worker
 from policy.agents.approaches import AgentConfig, compact, paper
 from policy.agents.prediction_aware import PredictionAware
 from policy.training.config import agent_config
-from policy.training.curriculum import Drive, Drove, Lesson
+from policy.training.curriculum import Drive, DriveResult, Lesson
 from policy.training.ddqn import DdqnLearner
 from policy.training.replay_buffer import ReplayBuffer
 
@@ -136,7 +136,7 @@ def training(config: str, lesson: Lesson, episodes: int) -> dict[str, float]:
             learner.update(replay.sample(rng))
             updates += 1
         elapsed = time.perf_counter() - began
-        drove: list[Drove] = [future.result() for future in waiting]
+        drove: list[DriveResult] = [future.result() for future in waiting]
     steps = sum(figure(one, "steps") for one in drove)
     whole = file.training.iterations * file.training.episodes
     return {
@@ -153,7 +153,7 @@ def training(config: str, lesson: Lesson, episodes: int) -> dict[str, float]:
     }
 
 
-def figure(one: Drove, name: str) -> float:
+def figure(one: DriveResult, name: str) -> float:
     """A figure present in every drive."""
     value = one.figures[name]
     assert value is not None

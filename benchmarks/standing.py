@@ -20,14 +20,14 @@ from typing import Any
 from benchmarks.tables import markdown_row
 from cosim.episode import Episode, Hook, Step
 from cosim.host import Host
-from cosim.metrics.standing import STANDING, WAIT
+from cosim.metrics.standing import CLOSED, STANDSTILL
 from cosim.scenario import Fleet, Scenario, load
 from cosim.scenario.vet import vetted
 from cosim.types import EpisodeResult, Kind, Preset
 from cosim.workers.worker import Worker
 
 LONG = 120.0  # s
-SIGNALS = frozenset(map(chr, WAIT))
+SIGNALS = frozenset(map(chr, CLOSED))
 CAR, NONE = "car-alone", "none"
 POLICIES = (NONE, "idm", "idm-courteous", CAR)
 FIGURES = {
@@ -61,7 +61,7 @@ class LongStands(Hook):
         excused = self._wrecks.union(frame.events.stopped)
         since: dict[str, float] = {}
         for row, name in enumerate(frame.ids):
-            if frame.speed[row] >= STANDING or frame.kind[row] == Kind.PERSON:
+            if frame.speed[row] >= STANDSTILL or frame.kind[row] == Kind.PERSON:
                 continue
             lights = sumo.vehicle.getNextTLS(name)
             waits = name in excused or (bool(lights) and lights[0][3] in SIGNALS)

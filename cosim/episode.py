@@ -1,4 +1,4 @@
-"""The one loop: observe, decide, command, advance; hooks see every step of it."""
+"""The episode loop: observe, decide, command, advance; hooks observe every step."""
 
 from __future__ import annotations
 
@@ -42,18 +42,18 @@ from cosim.types import (
     Traffic,
 )
 
-# Of the vehicles that were due: if more were never inserted, the demand is above capacity. Fewer are a queue
-# that empties: a vehicle is always due at the very end.
+# Share of due vehicles that were never inserted, above which the demand exceeds capacity. A smaller share is
+# a normal queue: a vehicle is always due at the very end.
 MAX_WAITING_SHARE = 0.05
-Progress = Callable[[float, float], None]  # simulated s so far, of s in all
+Progress = Callable[[float, float], None]  # simulated s so far, total s
 
 
 class Step(NamedTuple):
-    """One decision period, carried out."""
+    """One completed decision period."""
 
     before: Snapshot
-    decisions: Mapping[str, Decision]  # of the AVs that were commanded
-    # Whose commands have had their time: `decisions`; with a `decision_latency` those of the step before
+    decisions: Mapping[str, Decision]  # of the commanded AVs
+    # Decisions in effect during the period: `decisions`; with a `decision_latency` those of the step before
     carried_out: Mapping[str, Decision]
     commands: tuple[Command, ...]
     receipts: tuple[Receipt, ...]  # of each command
@@ -65,14 +65,14 @@ class Step(NamedTuple):
 
     @property
     def events(self) -> Events:
-        """What happened in all of its frames."""
+        """The events of all its frames."""
         return Events.of(self.frames)
 
 
 class Observed(Mapping[str, History]):
-    """What every AV observes now, worked out by `look` when it is first asked for: SUMO's driver never asks.
+    """Every AV's present observation, computed by `look` on first access; SUMO's driver never needs it.
 
-    Raises RuntimeError when it is first asked for after the next decision was carried out.
+    Raises RuntimeError on first access after the next decision period.
     """
 
     def __init__(self, look: Callable[[], dict[str, History]]) -> None:
@@ -80,7 +80,7 @@ class Observed(Mapping[str, History]):
         self._found: dict[str, History] | None = None
 
     def expire(self) -> None:
-        """The simulation goes on: what nobody has looked at by now cannot be seen any more."""
+        """Called when the simulation advances: a missing observation can no longer be computed."""
         self._look = None
 
     @property
@@ -102,23 +102,23 @@ class Observed(Mapping[str, History]):
 
 
 class Hook:
-    """Sees an episode while it is driven, and changes nothing; override what is needed."""
+    """A passive observer of an episode; override the needed methods."""
 
     def on_start(self, episode: Episode) -> None:
-        """The warm-up is driven (`episode.frames`: its last frames), the clock is at 0."""
+        """Called after the warm-up (`episode.frames`: its last frames), with the clock at 0."""
 
     def on_step(self, episode: Episode, step: Step) -> None:
-        """A decision was carried out; `episode.histories` are what the AVs observe now."""
+        """Called after a decision period; `episode.histories` are the AVs' present observations."""
 
 
 class Episode:
-    """Many episodes, one after another, of one scenario on one simulator.
+    """Consecutive episodes of one scenario on one simulator.
 
-    `start` and `advance` return what every AV on the road observes; decisions given to `advance` are
-    commanded, AVs without one are driven by SUMO. `terminated` after a collision of an AV or the mission
-    vehicle unless the scenario goes on, `truncated` when its duration is over (figures.md, Episode), or
-    when another program has ended the simulation.
-    `metrics` are measured besides those of `cosim.metrics.METRICS`.
+    `start` and `advance` return the observation of every AV on the road. Decisions given to `advance` are
+    commanded; SUMO drives AVs without a decision. `terminated` after a collision of an AV or the mission
+    vehicle unless the scenario goes on; `truncated` when its duration is over (figures.md, Episode), or when
+    another program has ended the simulation.
+    `metrics` are measured in addition to `cosim.metrics.METRICS`.
     """
 
     def __init__(
@@ -135,7 +135,7 @@ class Episode:
         self._metrics = Metrics(metrics)
 
     def start(self, seed: int, hooks: Sequence[Hook] = ()) -> Observed:
-        """Begin the episode `seed`: warm-up driven, clock at 0; `hooks` see it until the next start."""
+        """Begin the episode `seed` and drive its warm-up; `hooks` observe it until the next start."""
         began = clock()
         frames = self.simulator.reset(seed)
         self.timings = dict.fromkeys(("reset_s", "simulation_s", "observation_s", "decision_s"), 0.0)
@@ -146,19 +146,19 @@ class Episode:
         self.frames: tuple[Snapshot, ...] = frames
         self.step: Step | None = None  # the last one
         self.terminated = self.truncated = False
-        self._ended = ""  # why the simulation ended before its time
+        self._ended = ""  # reason of an early end of the simulation
         self._begin = self.snapshot.time
         self._collisions: list[Collision] = []
         self._interventions: Counter[str] = Counter()  # by reason
         self._errors: list[HumanError] = []
-        self._missions: dict[str, None] = {}  # every mission vehicle seen, in order of appearance
+        self._missions: dict[str, None] = {}  # every mission vehicle so far, in order of appearance
         self._tally: dict[str, int] = dict.fromkeys(
             ("decisions", "vetoes", "fallbacks", "lane_changes", "blocked"), 0
         )
         sensing = self.scenario.sensing
         self._hash = hashlib.sha256(b"" if sensing is None else sensing.digest.encode())
         self._late = self.scenario.decision_latency > 0.0
-        self._acting: tuple[Mapping[str, Decision], tuple[Command, ...]] = {}, ()  # while they are late
+        self._acting: tuple[Mapping[str, Decision], tuple[Command, ...]] = {}, ()  # delayed
         context = MetricContext(
             road=self.simulator.road,
             timing=self.scenario.timing,
@@ -178,12 +178,12 @@ class Episode:
 
     @property
     def collisions(self) -> tuple[Collision, ...]:
-        """So far."""
+        """All collisions so far."""
         return tuple(self._collisions)
 
     @property
     def offences(self) -> list[Offence]:
-        """What AVs did against the law so far, as the figures count it; by time."""
+        """Offences of AVs so far, as counted in the figures; by time."""
         return self._metrics.offences
 
     def advance(self, decisions: Mapping[str, Decision]) -> Observed:
@@ -225,13 +225,13 @@ class Episode:
         return self.histories
 
     def context(self, seed: int, svo: float) -> PolicyContext:
-        """What a policy gets to know of the episode `seed` before it starts; `svo` (phi) in rad."""
+        """The policy's context for the episode `seed`; `svo` (phi) in rad."""
         sensing = self.scenario.sensing
         return PolicyContext(
             road=self.simulator.road,
             timing=Timing()
             if self.scenario.traffic == Traffic.AS_IS
-            else self.scenario.timing,  # no AV comes
+            else self.scenario.timing,  # without AVs
             observation=self.observation,
             svo=svo,
             rng=generator(seed, "policy"),
@@ -320,7 +320,7 @@ class Episode:
         update(repr(sorted(asked)).encode())
 
     def _validity(self, metrics: Mapping[str, Metric]) -> tuple[str, ...]:
-        """Why this result must not be compared with others; empty when it may be."""
+        """Reasons why this result is not comparable with others; empty if it is."""
         reasons = list(self.scenario.warnings)
         if self._ended:
             reasons.append(f"ended after {self.elapsed:g} s of {self.scenario.duration:g} s: {self._ended}")

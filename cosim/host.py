@@ -1,4 +1,4 @@
-"""The one place that assembles simulator, episode and policy in a process."""
+"""The assembly of simulator, episode and policy in one process."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -13,7 +13,7 @@ from cosim.files import code
 from cosim.metrics import MetricFactory, joined
 from cosim.metrics import read as read_metric
 from cosim.policies import compensator, make
-from cosim.recording.recorder import DRAWN, Recorder
+from cosim.recording.recorder import MAX_DRAWN_FRAMES, Recorder
 from cosim.recording.replay_data import ReplayData, replay_data
 from cosim.rewards import Reward, RewardTerms, rewards
 from cosim.rewards import read as read_reward
@@ -31,12 +31,12 @@ class Host:
     """One scenario, one policy (a name or an object), any number of episodes; runs in a worker process.
 
     Args:
-        scenario: what is simulated, vetted.
-        policy: who commands the AVs.
+        scenario: the vetted scenario.
+        policy: commands the AVs.
         svo: phi in rad, passed to the policy.
-        observation: what the AVs observe; by default what the policy wants to see.
-        simulator: builds another simulator than SUMO's.
-        metrics: measured besides those of `cosim.metrics.METRICS`: factories, or FILE.py:NAME.
+        observation: of the AVs; by default the policy's.
+        simulator: builds a replacement of SUMO.
+        metrics: additional to `cosim.metrics.METRICS`: factories, or FILE.py:NAME.
         reward: reported as the figure `reward_mean`: an object, or a text that `cosim.rewards.read` accepts.
 
     Raises BadInput for an unknown policy and for input that SUMO refuses.
@@ -64,7 +64,7 @@ class Host:
         make_torch_deterministic()
         self.simulator = (simulator or sumo)(scenario, self.policy.av_parameters, wanted.frames)
         if scenario.sensing is not None and scenario.sensing.parameters.compensation in PREDICTED:
-            sensing: Any = self.simulator  # SUMO's alone has percepts
+            sensing: Any = self.simulator  # only SUMO's simulator has percepts
             how = scenario.sensing.parameters.compensation
             sensing.compensator = compensator(how, self.simulator.road, scenario.timing)
         self.simulator.courtesy = courtesy(svo)
@@ -73,7 +73,7 @@ class Host:
         self.episode = Episode(scenario, self.simulator, wanted, measured)
 
     def policy_files(self) -> dict[str, str]:
-        """SHA-256 by file name: what decides how the policy drives, and a user's metrics and reward."""
+        """SHA-256 by file name, of the policy's weights and code and a user's metrics and reward."""
         return self._policy_files
 
     def run(
@@ -85,9 +85,9 @@ class Host:
         outputs: Sequence[str] = (),
         folder: Path | None = None,
     ) -> EpisodeResult:
-        """One whole episode; SUMO's own `outputs` (`cosim.scenario.sumo_outputs`) go whole into `folder`."""
+        """One whole episode; SUMO's own `outputs` (`cosim.scenario.sumo_outputs`) go into `folder`."""
         with drafts(outputs, folder) as files:
-            simulator: Any = self.simulator  # files are SUMO's own
+            simulator: Any = self.simulator  # only SUMO's simulator writes files
             if files:
                 simulator.write_outputs(files)
             try:
@@ -114,8 +114,8 @@ class Host:
         outputs: Sequence[str] = (),
         folder: Path | None = None,
     ) -> tuple[EpisodeResult, ReplayData]:
-        """`run`, recorded: the same result, and what a replay draws."""
-        recorder = Recorder(self.policy, DRAWN)
+        """`run` with a recording: the same result, and the data of a replay."""
+        recorder = Recorder(self.policy, MAX_DRAWN_FRAMES)
         result = self.run(seed, progress, hooks=[recorder], outputs=outputs, folder=folder)
         return result, replay_data(recorder, self.simulator, result.document())
 
@@ -125,39 +125,39 @@ class Host:
 
 
 class Earnings(Hook):
-    """What the AVs on the road earn by one reward, decision by decision; `svo` (phi) in rad."""
+    """Rewards of the AVs on the road, decision by decision; `svo` (phi) in rad."""
 
     def __init__(self, reward: Reward, svo: float) -> None:
         self.reward, self.svo = reward, svo
         self.totals: list[float] = []
 
     def on_step(self, episode: Episode, step: Step) -> None:
-        """One decision of every AV that was on the road."""
+        """Reward every AV on the road for one decision."""
         self.totals += [terms.total for terms in self.pay(step, step.before.avs).values()]
 
     def pay(self, step: Step, avs: Sequence[str]) -> dict[str, RewardTerms]:
-        """What each of `avs` earned in this step."""
+        """The reward of each of `avs` in this step."""
         actions = {av: decision.action for av, decision in step.decisions.items()}
         happened = step.events.collisions
         return rewards(step.before, step.after, avs, actions, self.svo, self.reward, happened)
 
     @property
     def mean(self) -> float | None:
-        """Per AV and decision; None where no AV was on the road."""
+        """Mean per AV and decision; None without an AV on the road."""
         return float(np.mean(self.totals)) if self.totals else None
 
 
 class Hosts:
-    """One host at a time: its next seed costs a reset, another host a start."""
+    """A cache of one host: a new seed costs a reset, another host a start of SUMO."""
 
     def __init__(self) -> None:
         self._host: Host | None = None
         self._key: object = None
 
     def host(self, key: object, build: Callable[[], Host]) -> Host:
-        """The present host where it is the one of this `key`, else what `build` makes."""
+        """The present host if it has this `key`, else the result of `build`."""
         if self._host is None or key != self._key:
-            self.close()  # one simulation per process: the old one must go first
+            self.close()  # libsumo allows one simulation per process
             self._host, self._key = build(), key
         return self._host
 
@@ -170,13 +170,13 @@ class Hosts:
 
 def sumo(scenario: Scenario, av_parameters: Mapping[str, str], history: int) -> Simulator:
     """SUMO in this process; `history`: frames of the warm-up that a reset returns."""
-    from cosim.simulation.sumo import SumoSimulator  # libsumo: in the worker's process alone
+    from cosim.simulation.sumo import SumoSimulator  # libsumo: in the worker's process only
 
     return SumoSimulator(scenario, av_parameters=av_parameters, history=history)
 
 
 def serving(port: int, clients: int) -> SimulatorFactory:
-    """SUMO in this process, which `clients` TraCI programs share at `port` (docs/guides/traci.md)."""
+    """SUMO in this process, shared with `clients` TraCI programs at `port` (docs/guides/traci.md)."""
 
     def simulator(scenario: Scenario, av_parameters: Mapping[str, str], history: int) -> Simulator:
         from cosim.simulation.shared import ServingSimulator
@@ -187,7 +187,7 @@ def serving(port: int, clients: int) -> SimulatorFactory:
 
 
 def joining(client: Any) -> SimulatorFactory:
-    """The SUMO that a `cosim.simulation.client.Client` has joined."""
+    """The SUMO of a joined `cosim.simulation.client.Client`."""
 
     def simulator(scenario: Scenario, av_parameters: Mapping[str, str], history: int) -> Simulator:
         from cosim.simulation.shared import TraciSimulator

@@ -37,11 +37,11 @@ class MetaAction(IntEnum):
     DECELERATE = 4
 
 
-LANE_OFFSET = {MetaAction.LANE_LEFT: 1, MetaAction.LANE_RIGHT: -1}  # as SUMO counts: left is up
+LANE_OFFSET = {MetaAction.LANE_LEFT: 1, MetaAction.LANE_RIGHT: -1}  # SUMO's sign convention: left is positive
 
 
 class ContinuousAction(NamedTuple):
-    """What an agent may ask of one AV in place of a meta-action, for one decision.
+    """A continuous action of one AV for one decision, in place of a meta-action.
 
     Attributes:
         accel: m/s2, within the limits of the car (`cosim.control`) and, in `lawful`, of comfort and law.
@@ -53,12 +53,12 @@ class ContinuousAction(NamedTuple):
 
     @property
     def lane_change(self) -> MetaAction:
-        """The meta-action of the same lane change; IDLE without one."""
+        """The meta-action of this lane change; IDLE without a lane change."""
         return {1: MetaAction.LANE_LEFT, -1: MetaAction.LANE_RIGHT}.get(self.lane_offset, MetaAction.IDLE)
 
 
 class Kind(IntEnum):
-    """Who it is: a human-driven vehicle (HV), an autonomous one (AV), or a person on foot."""
+    """The kind of an object: human-driven vehicle (HV), autonomous vehicle (AV), or person on foot."""
 
     HV = 0
     AV = 1
@@ -66,7 +66,7 @@ class Kind(IntEnum):
 
 
 class Actor(IntEnum):
-    """What it is, by SUMO's vehicle class."""
+    """The type of an object, by SUMO's vehicle class."""
 
     CAR = 0
     TRUCK = 1
@@ -78,7 +78,7 @@ class Actor(IntEnum):
 
 
 class Preset:
-    """What the car does whoever commands it (presets.md, Presets): every result names it."""
+    """The car's own behaviour under any policy (presets.md, Presets); part of every result."""
 
     LAWFUL = "lawful"  # the car keeps the law, comfortably, and brakes in an emergency
     UNGUARDED = "unguarded"  # commands are carried out within physical limits: the agent can crash
@@ -87,18 +87,18 @@ class Preset:
 
 
 class OnCollision:
-    """What a crash does to an episode (docs/reference/figures.md, Episode)."""
+    """The effect of a crash on an episode (docs/reference/figures.md, Episode)."""
 
     END = "end"  # the episode ends
-    CONTINUE = "continue"  # it goes on; the wrecks stand, and are taken off the road
+    CONTINUE = "continue"  # the episode continues; wrecks stand, then are taken off the road
     ALL = (END, CONTINUE)
 
 
 class Traffic:
-    """Whose SUMO options drive a user's file (formats.md, Traffic options): every result names it."""
+    """The source of SUMO's options for a user's file (formats.md, Traffic options); part of every result."""
 
-    AS_IS = "as-is"  # the file's own: as plain SUMO drives it
-    CONTROLLED = "controlled"  # with what AVs, other drivers and figures need, each change named
+    AS_IS = "as-is"  # the file's own, as in plain SUMO
+    CONTROLLED = "controlled"  # with the changes required by AVs, other drivers and figures, each named
     ALL = (AS_IS, CONTROLLED)
 
 
@@ -109,8 +109,8 @@ INSERTION, INSIDE = "insertion", "junction"  # of `Collision.kind`
 class Collision:
     """One pair of vehicles (or of a vehicle and a person) that touched, reported once per pair and episode.
 
-    `source` is "sumo" (SUMO reported it) or "box" (only our oriented-box check saw it); `kind` is SUMO's word
-    (collision, side, junction), "overlap" for ours, or `INSERTION`: SUMO had just put one onto the other.
+    `source` is "sumo" (reported by SUMO) or "box" (found by cosim's oriented-box check only). `kind`:
+    SUMO's (collision, side, junction), "overlap" for cosim's, or `INSERTION`: SUMO inserted an overlap.
     """
 
     time: float  # s
@@ -125,12 +125,12 @@ class Collision:
     y: float  # m
     involves_mission: bool = False
     av_caused: bool = False  # an AV was the collider, or had just cut in
-    # one of both, or the vehicle just ahead of one, was erring or had been shortly before (HumanError)
+    # an error of either, or of the vehicle just ahead, was active now or shortly before (HumanError)
     human_error_involved: bool = False
 
     @property
     def insertion(self) -> bool:
-        """Nobody's fault: it counts for nobody."""
+        """Whether SUMO's insertion caused it: then it counts for no vehicle."""
         return self.kind == INSERTION
 
     @property
@@ -149,13 +149,13 @@ class Overlap:
 
     time: float  # s
     vehicles: tuple[str, str]
-    circumstance: str  # of `cosim.simulation.collisions.CIRCUMSTANCES`: what brings it about
+    circumstance: str  # the cause, one of `cosim.simulation.collisions.CIRCUMSTANCES`
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """An AV's front bumper passed a stop line in this simulation step, or the end of the place behind it at
-    which the net lets it wait inside the junction."""
+    """An AV's front bumper passed a stop line in this simulation step, or the internal waiting position
+    behind it."""
 
     time: float  # s, the end of the step
     vehicle: str
@@ -163,62 +163,62 @@ class Entry:
     state: str  # the signal's in this step (rRyYgGosu), "" without a signal
     speed: float  # m/s
     least_speed: float  # m/s, over the last 10 m before the line
-    yellow_since: float = -1.0  # s, when the signal turned yellow; -1 where it is not
+    yellow_since: float = -1.0  # s, when the signal turned yellow; -1 if not yellow
     yellow_distance: float = 0.0  # m to the line and
     yellow_speed: float = 0.0  # m/s of the vehicle at that instant; inf if it was not on the road yet
-    foes: tuple[tuple[str, int], ...] = ()  # who has the right of way within 100 m, each with its link
-    inside: bool = False  # passed the place inside, not the line
+    foes: tuple[tuple[str, int], ...] = ()  # vehicles with priority within 100 m, each with its link
+    inside: bool = False  # passed the internal waiting position, not the line
 
 
 @dataclass(frozen=True, slots=True)
 class Offence:
-    """What one AV did against the law, once for each that the figures count."""
+    """One AV's violation of a traffic law, as counted in the figures."""
 
     time: float  # s
     vehicle: str
-    what: str  # in words, of which the vehicle is the subject
+    what: str  # predicate of a sentence about the vehicle
 
 
 @dataclass(frozen=True, slots=True)
 class Intervention:
-    """The car began to drive otherwise than commanded (preset `lawful`)."""
+    """The car controller began to override the command (preset `lawful`)."""
 
     time: float  # s
     vehicle: str
     reason: str  # one of `cosim.control.REASONS`
 
 
-REMEMBERED = 5.0  # s after its end in which a human error still has a part in a collision
+ERROR_MEMORY = 5.0  # s after its end during which a human error still counts as involved in a collision
 
 
 @dataclass(frozen=True, slots=True)
 class HumanError:
-    """A human driver, or a person on foot, began to err (docs/explanation/driver_errors.md)."""
+    """An error of a human driver or a person on foot began (docs/explanation/driver_errors.md)."""
 
     time: float  # s
     who: str
     kind: str  # one of sumo_scenarios/errors.yaml
-    until: float  # s, when it ends as planned
-    what: str  # in words, of which the driver is the subject
-    near: str = ""  # whom it meets first: the vehicle behind, beside or with the right of way
+    until: float  # s, planned end
+    what: str  # predicate of a sentence about the driver
+    near: str = ""  # the vehicle affected first: behind, beside or with priority
 
     def had_a_part(self, collision: Collision) -> bool:
-        """Whether one of both erred or met who did, until the collision or `REMEMBERED` s before."""
+        """Whether this error involved one of both, at the collision or up to `ERROR_MEMORY` s before."""
         pair = collision.collider, collision.victim
-        in_time = self.time <= collision.time <= self.until + REMEMBERED
+        in_time = self.time <= collision.time <= self.until + ERROR_MEMORY
         return in_time and (self.who in pair or self.near in pair)
 
 
 class Due(NamedTuple):
-    """A vehicle that is to depart and has found no room so far."""
+    """A vehicle that is due to depart and waits for space."""
 
-    since: float  # s, its wished departure
-    is_av: bool  # what it will be
+    since: float  # s, scheduled departure
+    is_av: bool  # whether it will be an AV
 
 
 @dataclass(frozen=True, slots=True)
 class Events:
-    """What happened since the last snapshot; ids in SUMO's order."""
+    """Events since the last snapshot; ids in SUMO's order."""
 
     collisions: tuple[Collision, ...] = ()
     departed: tuple[str, ...] = ()
@@ -227,16 +227,16 @@ class Events:
     emergency_stopped: tuple[str, ...] = ()
     entries: tuple[Entry, ...] = ()
     interventions: tuple[Intervention, ...] = ()
-    depart_delays: tuple[float, ...] = ()  # s that each of `departed` waited to be inserted
-    stopped: tuple[str, ...] = ()  # stand at a stop of their plan at the frame's end
-    wrecked: tuple[str, ...] = ()  # crashed in an episode that goes on: they stand
-    wrecks_removed: tuple[str, ...] = ()  # and were taken off the road
+    depart_delays: tuple[float, ...] = ()  # s, insertion delay of each of `departed`
+    stopped: tuple[str, ...] = ()  # vehicles at a scheduled stop at the frame's end
+    wrecked: tuple[str, ...] = ()  # crashed vehicles that stand while the episode continues
+    wrecks_removed: tuple[str, ...] = ()  # wrecks taken off the road
     errors: tuple[HumanError, ...] = ()
     overlaps: tuple[Overlap, ...] = ()
 
     @classmethod
     def of(cls, frames: Sequence[Snapshot]) -> Events:
-        """What happened in all of `frames`, in their order."""
+        """The events of all `frames`, in their order."""
         every = [frame.events for frame in frames]
         return cls(**{f.name: tuple(x for e in every for x in getattr(e, f.name)) for f in fields(cls)})
 
@@ -246,7 +246,7 @@ NO_EVENTS = Events()
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Everybody on the road at one moment, sorted by id: vehicles and persons (`person:ID`).
+    """All vehicles and persons (`person:ID`) on the road at one moment, sorted by id.
 
         Shapes: all arrays [n], `signals` and `switches` [s]. Units: m, s, rad (counter-clockwise from
     east), m/s, m/s2.
@@ -266,23 +266,23 @@ class Snapshot:
     lane: npt.NDArray[np.int32]  # [n] index into RoadMap.lanes, -1 off every lane
     lane_position: Floats  # [n] m, of the front bumper along the lane
     events: Events = NO_EVENTS
-    # [n] Actor; where nothing is given all are cars, persons apart
+    # [n] Actor; default: cars, and persons
     actor: npt.NDArray[np.int8] = field(default_factory=lambda: np.zeros(0, np.int8))
-    # [n] for what can touch whom (`RoadMap.contact`): the lane; off every lane -2 - the edge's number in
-    # `RoadMap.contact.edges`, -1 where that is not known. Where nothing is given: `lane`
+    # [n] for possible contacts (`RoadMap.contact`): the lane; off every lane -2 - the edge's number in
+    # `RoadMap.contact.edges`, -1 if unknown. Default: `lane`
     place: npt.NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
     # [s] ord() of each state (rRyYgGosu), in the order of RoadMap.signals
     signals: Bytes = field(default_factory=lambda: np.zeros(0, np.uint8))
-    # [s] s until the next phase of each signal's light, as it is planned now; empty in recordings
+    # [s] s until the next phase of each signal, by the present plan; empty in recordings
     switches: Floats = field(default_factory=lambda: np.zeros(0))
-    # [n] s lost since departure against free flow (SUMO's timeLoss); nan where not known, as in recordings
+    # [n] s lost since departure against free flow (SUMO's timeLoss); nan if unknown, as in recordings
     time_loss: Floats = field(default_factory=lambda: np.zeros(0))
-    # [n] g/s of CO2 at this moment, by SUMO's emission model; nan where not known, as in recordings
+    # [n] g/s of CO2 at this moment, by SUMO's emission model; nan if unknown, as in recordings
     co2: Floats = field(default_factory=lambda: np.zeros(0))
-    waiting: Mapping[str, Due] | None = None  # who is to depart and has found no room; None: not known
-    # lane -> m/s where the limit is not the road's: variable speed signs, calibrators; none in recordings
+    waiting: Mapping[str, Due] | None = None  # vehicles waiting for insertion; None: unknown
+    # lane -> m/s where the limit differs from the road's: variable signs, calibrators; none in recordings
     limits: Mapping[int, float] = field(default_factory=dict)
-    # AV -> what it knows of all this; None: everything (ideal sensing)
+    # AV -> its percept; None: ideal sensing
     percepts: Mapping[str, Percept] | None = None
 
     def __post_init__(self) -> None:
@@ -311,13 +311,13 @@ class Snapshot:
 
     @cached_property
     def vehicles(self) -> Snapshot:
-        """The same without persons."""
+        """The snapshot without persons."""
         kept = np.flatnonzero(self.kind != int(Kind.PERSON))
         return self if len(kept) == self.n else self.only(kept)
 
     def only(self, rows: npt.NDArray[np.integer]) -> Snapshot:
-        """The same with only these of its rows [k], in this order."""
-        names = {f.name for f in fields(self)} - {"signals", "switches"}  # which have no row per vehicle
+        """The snapshot restricted to these rows [k], in this order."""
+        names = {f.name for f in fields(self)} - {"signals", "switches"}  # these have no row per vehicle
         columns = {name: getattr(self, name) for name in names}
         kept: dict[str, Any] = {k: v[rows] for k, v in columns.items() if isinstance(v, np.ndarray)}
         return replace(self, ids=tuple(self.ids[k] for k in rows), **kept)
@@ -329,33 +329,33 @@ class Snapshot:
 
 
 class Source(IntEnum):
-    """What an AV's newest measurement of an object comes from."""
+    """The source of an AV's newest measurement of an object."""
 
     TRUTH = 0  # ideal sensing, and the AV itself
     SENSOR = 1  # its own sensors
-    CAM = 2  # a message of the object about itself (ETSI EN 302 637-2)
-    CPM = 3  # a message of another AV whose sensors detected it (ETSI TS 103 324)
+    CAM = 2  # an object's message about itself (ETSI EN 302 637-2)
+    CPM = 3  # a message of another AV that detected the object (ETSI TS 103 324)
 
 
 class Unseen(IntEnum):
-    """Why an AV's own sensors do not detect an object in a frame."""
+    """The reason why an AV's own sensors do not detect an object in a frame."""
 
-    OUT_OF_RANGE = 0  # or of the field of view
-    HIDDEN = 1  # another vehicle's body or a building is in between
+    OUT_OF_RANGE = 0  # or outside the field of view
+    HIDDEN = 1  # behind another vehicle's body or a building
     MISSED = 2
 
 
 @dataclass(frozen=True)
 class Percept:
-    """What one AV knows of the world at a frame (docs/reference/sensing.md).
+    """One AV's knowledge of the traffic at a frame (docs/reference/sensing.md).
 
     Attributes:
-        world: the AV itself, as it is, and everybody it knows of, where it takes them to be; n in all.
+        world: the true state of the AV itself, and the estimated states of all known objects; n in all.
         age: [n] s since the newest measurement of each.
-        source: [n] `Source` of it.
-        hears: the AVs whose intentions reach it in time for a decision (MCM).
+        source: [n] `Source` of that measurement.
+        hears: the AVs whose intentions arrive in time for a decision (MCM).
         others: k vehicles and persons.
-        detected: [k] whether the AV's own sensors detect each of them now (3), else `Unseen`.
+        detected: [k] whether the AV's own sensors detect each of `others` now (3), else `Unseen`.
     """
 
     world: Snapshot
@@ -367,19 +367,19 @@ class Percept:
 
     @cached_property
     def unseen(self) -> dict[str, Unseen]:
-        """Vehicle or person -> why the AV's own sensors do not detect it, without those out of range."""
+        """Vehicle or person in range -> reason why the AV's own sensors do not detect it."""
         within = (self.detected == Unseen.HIDDEN) | (self.detected == Unseen.MISSED)
         return {self.others[k]: Unseen(self.detected[k]) for k in np.flatnonzero(within).tolist()}
 
 
 class Tracks(NamedTuple):
-    """What AVs know of V vehicles and persons, each AV itself among those it knows of.
+    """The AVs' tracks of V vehicles and persons; every AV also tracks itself.
 
-    An AV's own row is its state at the mean age of its tracks, so that its rows are of about one moment.
+    An AV's own row is its state at the mean age of its tracks, so that all its rows are of about one moment.
     """
 
     state: Floats  # [V,N,4] x m, y m, speed m/s, heading rad, a frame apart, newest at the measurement's time
-    valid: Bools  # [V,N] whether it was known
+    valid: Bools  # [V,N] known in that frame
     lane: Ints  # [V] index into `RoadMap.lanes`, -1 off every lane
     lane_position: Floats  # [V] m, front bumper along that lane
     length: Floats  # [V] m
@@ -388,14 +388,14 @@ class Tracks(NamedTuple):
     is_mission: Bools  # [V]
     person: Bools  # [V]
     age: Floats  # [V] s since the newest measurement
-    owner: Ints  # [V] the number of the AV whose knowledge it is
+    owner: Ints  # [V] number of the AV that owns the track
 
 
 class Compensator(Protocol):
-    """Predicts states that were measured a while ago to now, with a policy's predictor.
+    """Delay compensation: predicts late states to now with a policy's predictor.
 
     Attributes:
-        frames: N, how many past frames it is given.
+        frames: N, number of past frames in its input.
     """
 
     frames: int
@@ -416,7 +416,7 @@ NO_SOURCE: npt.NDArray[np.int8] = np.zeros(0, np.int8)
 
 
 class History(NamedTuple):
-    """What one AV knows at a decision: N frames, oldest first, and its own route.
+    """One AV's observation at a decision: N frames, oldest first, and its own route.
 
     Rows follow the vehicle, not its rank: `ids[r]` names the vehicle of row r in every frame
     ("" for an empty row); `valid[k, r]` says whether it was on the road at frame k. Row 0 is the ego.
@@ -434,12 +434,12 @@ class History(NamedTuple):
     route: RouteAhead  # lane centre lines ahead, dead ends, distance to the conflict zone
     time: float  # s
     rules: RulesAhead = NO_RULES  # signals, stop lines, right of way, crossings, limits on its own way
-    signals: Bytes = NO_SIGNALS  # [s] `Snapshot.signals`, for drawing maps of what comes
+    signals: Bytes = NO_SIGNALS  # [s] `Snapshot.signals`, for drawing predicted maps
     age: Floats = NO_AGE  # [R] s since the newest measurement of each row's vehicle; empty: all are 0
     source: npt.NDArray[np.int8] = NO_SOURCE  # [R] `Source` of that measurement; empty: all are the truth
-    # the AVs whose intentions reach it in time for this decision (MCM); None: all, where they are shared
+    # the AVs whose intentions arrive in time for this decision (MCM); None: all, if intentions are shared
     hears: frozenset[str] | None = None
-    decision_latency: float = 0.0  # s until what is decided now acts; the command before holds until then
+    decision_latency: float = 0.0  # s until this decision acts; the previous command holds until then
 
     @property
     def ego_speed(self) -> float:
@@ -448,7 +448,7 @@ class History(NamedTuple):
 
 
 class Decision(NamedTuple):
-    """What a policy chose for one AV, with what is needed to explain it. A = 5 meta-actions.
+    """A policy's choice for one AV, with its explanation. A = 5 meta-actions.
 
     Attributes:
         action: the meta-action; with `accel`, the lane change alone.
@@ -456,7 +456,7 @@ class Decision(NamedTuple):
         safety_score: [A] s, weighted time to collision (P, algorithm 2).
         unsafe: [A] whether the safety prioritizer refuses the action.
         ttc: [A] s until first contact under the action, capped.
-        blamed: which vehicle made the preferred action unsafe, or another reason in brackets.
+        blamed: the vehicle that made the preferred action unsafe, or another reason in brackets.
         vetoed: whether the preferred action was refused.
         fallback: whether every action was unsafe, and the highest score was taken.
         accel: m/s2, in place of a target speed.
@@ -474,44 +474,42 @@ class Decision(NamedTuple):
 
 
 class Forecast(NamedTuple):
-    """What a policy expected of the vehicles it knew at its last decision: V vehicles, M frames ahead.
+    """A policy's prediction at its last decision: V known vehicles, M frames ahead.
 
-    A policy that predicts may keep one as `last_forecast`; replays draw it, nothing else reads it.
+    A policy may expose one as `last_forecast`, which is used by replays only.
     """
 
     ids: tuple[str, ...]  # V
     x: Floats  # [V,M] m, vehicle centre
     y: Floats  # [V,M] m
     heading: Floats  # [V,M] rad
-    along_std: Floats  # [V,M] m, standard deviation in driving direction; 0 where it is not known
+    along_std: Floats  # [V,M] m, standard deviation in driving direction; 0 if unknown
     across_std: Floats  # [V,M] m
     interval: float  # s between frames; the first one lies one interval ahead
 
 
 class Command(NamedTuple):
-    """What one AV shall do until the next decision."""
+    """One AV's command until the next decision."""
 
     vehicle: str
     target_speed: float  # m/s
     lane_offset: int  # -1 right, 0 keep, +1 left
     hold: float  # s
-    limit: float = (
-        math.inf
-    )  # m/s, the most that the law allows, as far as the agent sees it (preset `lawful`)
-    accel: float | None = None  # m/s2, held until the next decision; `target_speed` is where it leads to
+    limit: float = math.inf  # m/s, highest lawful speed known to the agent (preset `lawful`)
+    accel: float | None = None  # m/s2, held until the next decision; `target_speed` is the resulting speed
 
 
 class Receipt(NamedTuple):
-    """What became of a command: lane changes are never dropped silently."""
+    """The outcome of a command: lane changes are never dropped silently."""
 
     vehicle: str
     executed: bool
-    blocked: str | None = None  # why not
+    blocked: str | None = None  # reason if not executed
 
 
 @dataclass(frozen=True, slots=True)
 class ObservationConfig:
-    """What an AV sees. The defaults are the compact size; `PAPER` is the papers'.
+    """The observation of an AV. The defaults are the compact size; `PAPER` is the papers'.
 
     Attributes:
         height: pixels of the map across the road.
@@ -522,11 +520,11 @@ class ObservationConfig:
         frames: N, past frames of 0.2 s.
         rows: R, the AV itself and up to 15 others.
         row_range: m, beyond which a vehicle gets no row.
-        perception_range: m that an AV's own sensors reach.
-        share_perception: whether AVs share what they perceive (V2V).
+        perception_range: m, range of an AV's own sensors.
+        share_perception: whether AVs share their perception (V2V).
         maps: whether velocity maps are drawn.
         road_version: of the road channel; 2 draws the law too (stop lines, signals, crossings).
-        signal_timing: whether an AV knows when the next signal switches.
+        signal_timing: whether an AV knows the next signal's switching time.
     """
 
     height: int = 32
@@ -544,7 +542,7 @@ class ObservationConfig:
     signal_timing: bool = False
 
     def __post_init__(self) -> None:
-        """Raises BadInput when a size or a range is none, or the road channel's version is unknown."""
+        """Raises BadInput for an invalid size or range, or an unknown version of the road channel."""
         if self.road_version not in (1, 2):
             raise BadInput("must be 1 or 2", field="road_version", value=self.road_version)
         sizes = "height width metres_across metres_along frames rows"
@@ -567,7 +565,7 @@ class Timing:
 
 @dataclass(frozen=True, slots=True)
 class PolicyContext:
-    """The circumstances of an episode, given to a policy when it starts."""
+    """The context of an episode, given to a policy at its start."""
 
     road: RoadMap
     timing: Timing
@@ -575,24 +573,24 @@ class PolicyContext:
     svo: float  # rad, the social value orientation phi
     rng: np.random.Generator
     preset: str = Preset.UNGUARDED
-    # V2V: AVs pool what they know; not where each has a percept, which holds what messages told it
+    # V2V: AVs pool their knowledge; not with percepts, which contain received messages already
     share_perception: bool = True
     share_intentions: bool = True  # V2V: AVs decide front to back and know the choices before theirs
 
     @property
     def pooled(self) -> bool:
-        """Whether AVs pool what they know."""
+        """Whether AVs pool their knowledge."""
         return self.share_perception and self.observation.share_perception
 
 
 class Policy(Protocol):
-    """What commands the AVs. One object serves every AV of an episode.
+    """A policy commands the AVs. One object serves every AV of an episode.
 
     Attributes:
-        name: what rows call it.
-        observation: what it wants to see.
-        av_parameters: SUMO's parameters of AVs that get no command.
-        label: a warning that stands beside every result, for example "untrained"; or "".
+        name: the policy's name in rows.
+        observation: the observation that it needs.
+        av_parameters: SUMO's parameters of AVs without a command.
+        label: a warning beside every result, for example "untrained"; or "".
     """
 
     name: str
@@ -601,32 +599,32 @@ class Policy(Protocol):
     label: str
 
     def reset(self, context: PolicyContext) -> None:
-        """A new episode begins."""
+        """Start an episode."""
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
-        """One decision per AV to command; SUMO's IDM drives an AV that is left out."""
+        """One decision per AV to command; SUMO's IDM drives an AV without a decision."""
 
 
-LookAhead = Callable[[int], Sequence[Snapshot]]  # so many frames ahead (`Simulator.ahead`)
+LookAhead = Callable[[int], Sequence[Snapshot]]  # number of frames -> future snapshots (`Simulator.ahead`)
 
 
 @runtime_checkable
 class LooksAhead(Protocol):
-    """A policy that asks the simulation itself what will come: an oracle, a planner with a perfect model."""
+    """A policy that reads the simulation's future: an oracle, or a planner with a perfect model."""
 
     def looks_ahead(self, look: LookAhead) -> None:
-        """`look(n)`, once an episode has begun: the next n frames (`Simulator.ahead`)."""
+        """Receive `look(n)`, valid during an episode: the next n frames (`Simulator.ahead`)."""
 
 
 class Simulator(Protocol):
-    """The world behind the loop: SUMO (`cosim.simulation.sumo`) or the in-memory fake."""
+    """The simulator of the loop: SUMO (`cosim.simulation.sumo`) or the in-memory fake."""
 
     road: RoadMap
-    goal_lanes: frozenset[int]  # being on one of them fulfils the mission
+    goal_lanes: frozenset[int]  # lanes on which the mission is fulfilled
     courtesy: float  # of commanded AVs in preset `lawful`, 0 to 1, set before the first `reset`
 
     def reset(self, seed: int) -> tuple[Snapshot, ...]:
-        """Start the episode `seed` and drive its warm-up; the warm-up's last frames, newest last."""
+        """Start the episode `seed`, drive its warm-up and return its last frames, newest last."""
 
     def advance(self, commands: Sequence[Command]) -> tuple[tuple[Receipt, ...], tuple[Snapshot, ...]]:
         """Hold the commands for one decision; one snapshot per frame, the newest last."""
@@ -634,21 +632,21 @@ class Simulator(Protocol):
     def ahead(
         self, frames: int, commands: Sequence[Command] = (), *, errors: bool = False
     ) -> tuple[Snapshot, ...]:
-        """What would come if the AVs went on as they are commanded, those of `commands` as these say; nothing
-        changes. `errors`: whether human errors that have not begun may begin."""
+        """A counterfactual rollout with the AVs' present commands, replaced by `commands` where given; the
+        simulation itself does not change. `errors`: whether new human errors may begin."""
 
     def route(self, vehicle: str) -> tuple[str, ...]:
-        """The edges the vehicle still has to drive, its present edge first (own route knowledge)."""
+        """The remaining edges of the vehicle's route, its present edge first."""
 
     def commanded(self, vehicle: str) -> tuple[float | None, int]:
         """Present target speed in m/s (None while uncommanded) and lane change under way (+1, 0, -1)."""
 
     @property
     def tilted(self) -> tuple[float, Mapping[str, Sequence[float]]]:
-        """Of this episode's errors: log(q / p), and what was tilted, case by case (estimate.md)."""
+        """Importance weight of this episode's errors: log(q / p), and each tilted draw (estimate.md)."""
 
     def counts(self) -> dict[str, int]:
-        """Vehicles since the start: `inserted`, and `waiting` ones that found no room so far."""
+        """Vehicles since the start: `inserted`, and those still `waiting` for insertion."""
 
     def close(self) -> None:
         """End the simulation; safe to call twice."""
@@ -656,7 +654,7 @@ class Simulator(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """One figure of a result with its unit and which direction is better ("higher", "lower", "")."""
+    """One figure of a result with its unit and its better direction ("higher", "lower", "")."""
 
     value: float | int | bool | None  # None is NA, never 0
     unit: str
@@ -665,15 +663,15 @@ class Metric:
 
 @dataclass(frozen=True)
 class Identity:
-    """What an episode is called in documents, rows, tables, recordings."""
+    """The identity of an episode in documents, rows, tables, recordings."""
 
     scenario: str
     demand: str
     policy: str
-    policy_label: str | None  # e.g. "untrained"; None where it was never made
+    policy_label: str | None  # e.g. "untrained"; None if the policy was never built
     behavior: str
     driver_model: str
-    penetration: float | None  # share of AVs, where that chooses them
+    penetration: float | None  # share of AVs, if the fleet is chosen by share
     preset: str
     errors: str | None = field(default=None, kw_only=True)  # a level, or a file's stem and digest; None: none
     sensing: str | None = field(
@@ -684,9 +682,9 @@ class Identity:
 
 
 IDENTITY = tuple(field.name for field in fields(Identity))
-# Wall time, never repeatable: compilation of kernels counts in the total alone.
+# Wall time, not reproducible; compilation of kernels counts in the total only.
 TIMINGS = ("compilation_s", "reset_s", "simulation_s", "observation_s", "decision_s", "total_s")
-# What stands beside the figures in documents and rows: no figure may be called so.
+# Other fields of documents and rows, reserved: no figure may have these names.
 MISSION = ("mission_vehicle", "mission_guessed")
 WEIGHT = "weight"  # of an episode whose errors were drawn from tilted rates (docs/guides/estimate.md)
 TILT = (WEIGHT, "log_ratio", "tilted", "tilt_trials")
@@ -711,17 +709,17 @@ RESERVED = {
 
 @dataclass(frozen=True)
 class EpisodeResult(Identity):
-    """Everything one episode yields; `document()` is what `cosim run --json` prints."""
+    """The result of one episode; `document()` is the output of `cosim run --json`."""
 
     steps: int  # decisions taken
     trace_hash: str
     metrics: dict[str, Metric]
     collisions: tuple[Collision, ...]
     timings: dict[str, float]  # s, by the names of `TIMINGS`
-    validity: tuple[str, ...]  # reasons why the result is not comparable; empty when it is
-    mission_vehicle: str | None = None  # its id (of several: joined by ", "); None: none was on the road
-    mission_guessed: bool = False  # nobody named it: its figures feed no gate
-    asked: dict[str, Any] = field(default_factory=dict)  # options that the identity does not say
+    validity: tuple[str, ...]  # reasons why the result is not comparable; empty if it is
+    mission_vehicle: str | None = None  # its id (several: joined by ", "); None: none was on the road
+    mission_guessed: bool = False  # chosen automatically: its figures are excluded from gates
+    asked: dict[str, Any] = field(default_factory=dict)  # options outside of the identity
     interventions_by_reason: dict[str, int] = field(default_factory=dict)  # the most frequent first
     errors_begun: tuple[HumanError, ...] = ()
     tilt: dict[str, Any] = field(default_factory=dict)  # by the names of `TILT`, of tilted errors
@@ -755,6 +753,6 @@ class EpisodeResult(Identity):
 
 
 def _plain(value: Any) -> Any:
-    """The value as JSON holds it: Python's own number, None for one that is not finite."""
+    """The value for JSON: a Python number, None if not finite."""
     value = value.item() if isinstance(value, np.generic) else value
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,7 +1,7 @@
-"""Which inputs a value network uses: it is asked again with one input replaced (a counterfactual).
+"""Attribution: the inputs that a value network uses, found by evaluating it with one input replaced.
 
-Nothing here changes how the agent drives. Where an encoder makes latents of maps, latents are replaced: each
-is of one frame, so that another frame's latent is what another frame's map becomes.
+Attribution does not change the agent's behaviour. With an encoder, latents are replaced in place of maps:
+each latent belongs to one frame, so replacing a latent equals replacing the map of that frame.
 """
 
 import math
@@ -17,30 +17,30 @@ from policy.inputs.tensors import States, svo_tensor, to_numpy
 from policy.networks.vfn import VFN
 
 ZEROED, PRESENT, OTHERS = "zeroed", "as at present", "another AV's"
-BLIND = "map branch", "its last layer zero"
-ORACLE = "prediction", "the fair oracle's"  # in closed loop alone: an agent of its own
-ANGLES = (0, 90)  # degrees that replace phi: the egoist's, and the other end
+MAP_BRANCH_OFF = "map branch", "its last layer zero"
+ORACLE = "prediction", "the fair oracle's"  # in closed loop only: a separate agent
+ANGLES = (0, 90)  # degrees that replace phi: egoist and full altruist
 
 
 Arguments = tuple[torch.Tensor | None, torch.Tensor, torch.Tensor, torch.Tensor]  # of VFN.forward
-# Over the decisions of single AVs: how many; those whose action changes, carried out (after the prioritizer)
-# and best valued; absolute difference of the action values, mean of the five; best value less the second best
+# Sums over the decisions of single AVs: count; changed actions, after the prioritizer and by value alone;
+# mean absolute difference of the five action values; highest value minus second highest
 SUMS = ("decisions", "choices_changed", "unmasked_changed", "mean_abs_dq", "spread")
 
 
 def questions(
     network: VFN, states: States, past: int, only: tuple[str, str] | None = None
 ) -> Iterator[tuple[str, str, Arguments]]:
-    """Every replacement of every input, or `only` one: (input, replacement, what the network is asked with).
+    """Every replacement of every input, or `only` one: (input, replacement, arguments of the network).
 
     Args:
-        network: who is asked.
-        states: what B AVs that decide together see; the first `past` frames of maps and kinematics have been
-            perceived, the others are predicted.
+        network: the evaluated network.
+        states: inputs of B AVs that decide together; the first `past` frames of maps and kinematics are
+            perceived, the others predicted.
 
-    Zeroed; as at present: the newest perceived frame in place of every other one; another AV's of the same
-    instant: that of the next row, where there are at least two. Without maps the layer that reads the
-    convolutions' output is as if its weights were zero (`VFN.forward`).
+    Replacements: zeroed; as at present (the newest perceived frame in every frame); another AV's of the same
+    instant (the next row, with at least two AVs). Without maps the layer behind the convolutions acts as if
+    its weights were zero (`VFN.forward`).
     """
     spans = {"past ": slice(past), "predicted ": slice(past, None), "all ": slice(None)}
     for field in network_inputs(network):
@@ -59,8 +59,8 @@ def questions(
                 changed = whole.clone()
                 changed[:, part] = other[:, part]
                 yield span + field, how, states._replace(**{field: changed})
-    if only in (None, BLIND):
-        yield *BLIND, (None, *states[1:])
+    if only in (None, MAP_BRANCH_OFF):
+        yield *MAP_BRANCH_OFF, (None, *states[1:])
     for angle in ANGLES:
         if only not in (None, ("phi", f"{angle} degrees")):
             continue
@@ -69,22 +69,22 @@ def questions(
 
 
 def network_inputs(network: VFN) -> tuple[str, ...]:
-    """Which of `States` it takes, phi apart."""
+    """The fields of `States` that the network takes, except phi."""
     kinematics = ("kinematics",) if network.kinematics is not None else ()
     return ("maps", *kinematics, *(("situation",) if network.config.kinematic else ()))
 
 
 def answer(agent: PredictionAware, arguments: Arguments) -> Floats32:
-    """The action values [B,A] that the agent's network gives."""
+    """The action values [B,A] of the agent's network."""
     with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=agent.config.bf16):
         return to_numpy(agent.vfn(*arguments))
 
 
 def replacements(network: VFN, past: int) -> list[tuple[str, str]]:
-    """The (input, replacement) with which episodes are driven: what is left when an input tells nothing.
+    """The pairs (input, replacement) for episodes in closed loop, where an input carries no information.
 
-    Another AV's of the same instant is an input as the network knows them; zeros are none. Predictions are
-    also replaced by the present.
+    Another AV's input of the same instant is within the training distribution; zeros are not. Predictions
+    are also replaced by the present.
     """
     found, predicts = [], network.config.frames > past
     for field in network_inputs(network):
@@ -92,26 +92,26 @@ def replacements(network: VFN, past: int) -> list[tuple[str, str]]:
         found.append((whole, OTHERS))
         if whole != field:
             found += [(f"predicted {field}", how) for how in (OTHERS, PRESENT)]
-    return [*found, BLIND, ("phi", f"{ANGLES[0]} degrees")]
+    return [*found, MAP_BRANCH_OFF, ("phi", f"{ANGLES[0]} degrees")]
 
 
 class _Encoding(PredictionAware):
-    """Perceives latents in place of maps where its network has an encoder."""
+    """The agent with latents in place of maps, if its network has an encoder."""
 
     def perceive(self, histories: Mapping[str, History]) -> Inputs:
-        """As the agent's."""
+        """See `PredictionAware.perceive`."""
         return self.encoded(super().perceive(histories))
 
 
 class Replaced(_Encoding):
-    """Drives by what its network answers with one input replaced; `what` None: by the network as it is."""
+    """The agent with one network input replaced; `what` None: the unchanged network."""
 
     def __init__(self, name: str, config: AgentConfig, what: tuple[str, str] | None) -> None:
         super().__init__(name, config)
         self._what = what
 
     def values(self, inputs: Inputs) -> Floats32:
-        """The action values [B,A]; an AV that decides alone has no other's input and keeps its own."""
+        """The action values [B,A]; an AV that decides alone keeps its own input."""
         if self._what is not None:
             for _, _, arguments in questions(self.vfn, inputs.states, self.observation.frames, self._what):
                 return answer(self, arguments)
@@ -119,20 +119,20 @@ class Replaced(_Encoding):
 
 
 class Questioned(_Encoding):
-    """Drives as the agent does; `answers` holds the episode's SUMS by input and replacement."""
+    """The unchanged agent; `answers` holds the episode's SUMS by input and replacement."""
 
     def reset(self, context: PolicyContext) -> None:
-        """A new episode."""
+        """Start an episode."""
         super().reset(context)
         self.answers: dict[tuple[str, str], Floats] = {}
 
     def choose(self, q: Floats32, inputs: Inputs) -> dict[str, Decision]:
-        """As the agent's, after the questions."""
+        """The agent's choice, after all counterfactual evaluations."""
         states, plain = inputs.states, answer(self, inputs.states)
         chosen, ordered = self._actions(plain, inputs), np.sort(plain, 1)
         for name, how, arguments in questions(self.vfn, states, self.observation.frames):
             other = answer(self, arguments)
-            same = np.array_equal(other, plain)  # spares the prioritizer
+            same = np.array_equal(other, plain)  # equal values need no second run of the prioritizer
             sums = (
                 len(plain),
                 0 if same else (self._actions(other, inputs) != chosen).sum(),
@@ -144,7 +144,7 @@ class Questioned(_Encoding):
         return super().choose(q, inputs)
 
     def _actions(self, q: Floats32, inputs: Inputs) -> Ints:
-        """[B] what these values lead to; the lane changes that were commanded stay as they are."""
+        """[B] actions that follow from these values; the record of commanded lane changes is unchanged."""
         kept, self._asked = self._asked, dict(self._asked)
         decisions = super().choose(q, inputs)
         self._asked = kept
@@ -152,17 +152,17 @@ class Questioned(_Encoding):
 
 
 class Explainer:
-    """Asks an agent, of one AV at each of its decisions, which inputs the choice hangs on.
+    """Attribution of one AV's choice at each of its decisions.
 
-    The agent drives as before. `uses`: [input, replacement, the action that it leads to, mean absolute
-    difference of the five action values] of every question of `replacements`, () where nothing was asked.
+    The agent's behaviour is unchanged. `uses`: [input, replacement, resulting action, mean absolute
+    difference of the five action values] of every pair in `replacements`, () without an observed AV.
     """
 
     def __init__(self, agent: PredictionAware) -> None:
-        self.asked: str | None = None  # the AV
+        self.asked: str | None = None  # the observed AV
         self.uses: tuple[tuple[str, str, int, float], ...] = ()
         self._agent, self._choose = agent, agent.choose
-        setattr(agent, "choose", self._explained)  # noqa: B010 - of this one agent
+        setattr(agent, "choose", self._explained)  # noqa: B010 - of this agent only
 
     def _explained(self, q: Floats32, inputs: Inputs) -> dict[str, Decision]:
         """The agent's choice, and `uses`."""
@@ -173,14 +173,14 @@ class Explainer:
         if self.asked not in agents:
             return decisions
         here, after = agents.index(self.asked), agent._asked
-        pair = [here, (here + 1) % len(agents)][: len(agents)]  # another AV's inputs are the next one's
+        pair = [here, (here + 1) % len(agents)][: len(agents)]  # the replacement is the next AV's input
         states = States(*(column[pair] for column in inputs.states))
         plain, found = answer(agent, states)[0], []
         past = agent.observation.frames
         for what in replacements(agent.vfn, past):
             for name, how, arguments in questions(agent.vfn, states, past, what):
                 row, action = answer(agent, arguments)[0], decisions[self.asked].action
-                if (np.argsort(row) != np.argsort(q[here])).any():  # else the prioritizer says the same
+                if (np.argsort(row) != np.argsort(q[here])).any():  # an equal ranking gives an equal choice
                     agent._asked, other = dict(before), q.copy()
                     other[here] = row
                     action = self._choose(other, inputs)[self.asked].action

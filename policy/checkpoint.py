@@ -1,7 +1,7 @@
 """Network weights on disk: safetensors and a JSON card beside it. Nothing is ever unpickled.
 
-`NAME.safetensors` holds the tensors; `NAME.json` says what they are: the networks' configurations, the
-SHA-256 of the tensor file, what they were trained on and the result measured with them.
+`NAME.safetensors` holds the tensors. `NAME.json` describes them: the networks' configurations, the SHA-256
+of the tensor file, the training data and the measured result.
 """
 
 import hashlib
@@ -48,7 +48,7 @@ def save(
             "measured": dict(measured or {}),
             "data": dict(data or {}),
         }
-        with whole(path.with_suffix(".json")) as text:  # first: weights that are there have their card
+        with whole(path.with_suffix(".json")) as text:  # the card first: weights never lack their card
             text.write_text(json.dumps(card, indent=2, sort_keys=True) + "\n")
 
 
@@ -69,8 +69,8 @@ def read_card(path: Path) -> dict[str, Any]:
 def load(path: Path, networks: Mapping[str, nn.Module], configs: Mapping[str, Any]) -> dict[str, Any]:
     """Fill `networks` from `path` and return the card.
 
-    Raises WeightsMismatch when the hash, a configuration, a tensor's name, shape or type is not what the
-    networks need, or when a value is not finite; then the networks are untouched.
+    Raises WeightsMismatch, with the networks untouched, when the hash, a configuration, or a tensor's name,
+    shape or type does not match the networks, or when a value is not finite.
     """
     card = read_card(path)
     for name, config in configs.items():
@@ -120,12 +120,12 @@ def sha256(path: Path) -> str:
 
 
 def plain(config: Any) -> Any:
-    """A configuration as JSON has it."""
+    """A configuration as JSON data."""
     return json.loads(json.dumps(asdict(config) if is_dataclass(config) else config))  # type: ignore[arg-type]
 
 
 def _defaults(config: Any) -> dict[str, Any]:
-    """What the fields of a configuration are when nobody sets them, as JSON has it."""
+    """The default values of a configuration's fields, as JSON data."""
     if not is_dataclass(config):
         return {}
     made = {f.name: f.default_factory() for f in fields(config) if f.default_factory is not MISSING}
@@ -134,7 +134,7 @@ def _defaults(config: Any) -> dict[str, Any]:
 
 
 def _filled(found: dict[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
-    """A stored configuration with the defaults of options that are newer than it (the default of a new option
-    must be what was done without it)."""
+    """A stored configuration, completed with defaults of newer options (the default of a new option must keep
+    the earlier behaviour)."""
     both = [k for k, v in found.items() if isinstance(v, dict) and isinstance(defaults.get(k), dict)]
     return {**defaults, **found, **{k: _filled(found[k], defaults[k]) for k in both}}

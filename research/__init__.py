@@ -1,1 +1,1 @@
-"""Claims as data: what a paper says and how it is tested; the engine drives, tests and writes pages."""
+"""Claims as data: a paper's statement and its test; the engine drives, tests and writes pages."""

@@ -1,4 +1,4 @@
-"""Some of the kept episodes driven anew: are they the same?"""
+"""An audit: drive a sample of the kept episodes again and compare them."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from research.drive import Settings, Work, engine
 
 @dataclass(frozen=True, slots=True)
 class Audited:
-    """What came of driving kept episodes anew."""
+    """The result of an audit."""
 
     driven: int
-    differing: tuple[str, ...]  # a line each: which episode, which column, what it was and is
+    differing: tuple[str, ...]  # a line each: episode, column, old and new value
     kept: int
-    unknown: int  # of those kept: of no claim, or of other weights, files or versions than are here
+    unknown: int  # kept episodes of no claim, or of other weights, files or versions
 
 
 def audit(work: Work, settings: Settings, sample: int, pick: int = 0) -> Audited:
@@ -32,7 +32,7 @@ def audit(work: Work, settings: Settings, sample: int, pick: int = 0) -> Audited
     rows = kept.episodes(settings.kept).rows
     mine = [row for row in rows if row["cell"] in work.wanted]
     picked = random.Random(pick).sample(mine, min(sample, len(mine)))
-    picked.sort(key=lambda row: row["key"])  # a cell's episodes one after the other
+    picked.sort(key=lambda row: row["key"])  # group the episodes of a cell
     anew = _driven(picked, work, settings)
     differing = tuple(line for row in picked for line in _differences(row, anew[row["key"]]))
     return Audited(len(picked), differing, len(rows), len(rows) - len(mine))
@@ -42,7 +42,7 @@ def audit(work: Work, settings: Settings, sample: int, pick: int = 0) -> Audited
 
 
 def _driven(rows: list[Row], work: Work, settings: Settings) -> dict[str, dict[str, Any]]:
-    """These episodes anew: key -> row."""
+    """The episodes driven again: key -> row."""
     cells = {cell.name: cell for cell in work.cells}
     cases = {row["key"]: cells[row["cell"]].case.with_seed(row["seed"]) for row in rows}
     tasks = [cells[case.cell].task(case) for case in cases.values()]
@@ -56,7 +56,7 @@ def _driven(rows: list[Row], work: Work, settings: Settings) -> dict[str, dict[s
 
 
 def _differences(row: Row, anew: Row) -> Iterator[str]:
-    """A line for every column that is not the same."""
+    """A line for every differing column."""
     if anew["status"] != OK:
         yield f"{row['key']}: {anew['status']}: {anew['error'] or anew['stderr']}"
         return
@@ -67,7 +67,7 @@ def _differences(row: Row, anew: Row) -> Iterator[str]:
 
 
 def _same(name: str, before: Any, now: Any) -> bool:
-    """Whether a column is what was kept; of collisions, in all that was told of them then."""
+    """Whether a column equals the kept one; for collisions, in the fields stored then."""
     if name != "collision_list" or before == now or None in (before, now):
         return bool(before == now)
     then, today = json.loads(before), json.loads(now)

@@ -14,7 +14,7 @@ from research import audit, drive, evaluate, index, kept, page, schema
 from research.drive import Settings
 from research.schema import Claim
 
-SAMPLE = 20  # episodes that `audit` drives anew
+SAMPLE = 20  # episodes of `audit`
 STALE, INTERRUPTED = 1, 130  # exit codes
 
 
@@ -102,7 +102,7 @@ COMMANDS = {"list": _list, "drive": _drive, "page": _page, "check": _check, "kee
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Flags that say how much is driven, by whom, and where it lies."""
+    """Flags for amount, engine and folders of the drives."""
     add, default = parser.add_argument, Settings()
     add("--workers", type=int, default=default.workers, metavar="N")
     add("--engine", choices=("local", "ray"), default=default.engine)

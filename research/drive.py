@@ -1,8 +1,8 @@
-"""Drives what the claims need, each episode once for all of them, into one store: killed, the same goes on.
+"""Drives the episodes of all claims, each once, into one resumable store.
 
-An episode counts only for what drove it: its options, the files of the policy and of the scenario by their
-hash, and the versions of the packages. All four stand in the name of its cell: new weights are driven anew,
-and what is there stays.
+An episode is identified by its options, the hashes of the policy's and the scenario's files, and the versions
+of the packages. All four are part of the cell's name, so new weights are driven again and existing episodes
+stay.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ from cosim.workers.progress import Progress
 from research import kept
 from research.schema import Claim, Condition
 
-LEAST = 2  # episodes, however small the scale
+MIN_EPISODES = 2  # episodes, however small the scale
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How much is driven, by whom, and where it lies. Defaults: all, as the pages need it."""
+    """Amount, engine and folders of the drives. Defaults: complete, as for the pages."""
 
     runs: Path = Path("runs/research")
     workers: int = 2
     engine: str = "local"  # or "ray"
-    kept: Path | None = kept.FOLDER  # episodes that need not be driven; None: every one is
-    scale: float = 1.0  # of the numbers of episodes
+    kept: Path | None = kept.FOLDER  # folder of stored episodes; None: drive all
+    scale: float = 1.0  # factor on the numbers of episodes
     seeds: range | None = None  # in place of every claim's own
     scenarios: tuple[str, ...] = ()  # (): all of a claim
     duration: float | None = None  # s; None: the scenario's own
@@ -52,7 +52,7 @@ class Settings:
     def seeds_of(self, claim: Claim, scenario: str) -> range:
         """The seeds of every arm in a scenario, fewer at a small scale."""
         seeds = claim.seeds_of(scenario) if self.seeds is None else self.seeds
-        return seeds[: max(round(len(seeds) * self.scale), LEAST)]
+        return seeds[: max(round(len(seeds) * self.scale), MIN_EPISODES)]
 
     def conditions(self, claim: Claim) -> list[Condition]:
         """Those of the scenarios that are wanted."""
@@ -61,12 +61,12 @@ class Settings:
 
 @dataclass(frozen=True)
 class Arm:
-    """One arm in one condition: what drives it, and the episodes that there are."""
+    """One arm in one condition: its policy and its episodes."""
 
     cell: matrix.Cell
     seeds: range
-    weights: str  # first digits of the SHA-256 of its network, or of its code; "": a script that ships
-    definitions: str  # the same of the policy's and the scenario's files and options
+    weights: str  # first digits of the SHA-256 of its network, or of its code; "": a shipped script
+    definitions: str  # first digits of the hash of the policy's and scenario's files and options
     label: str  # "untrained value network", or ""
     rows: tuple[Row, ...] = ()  # by seed, of any status
 
@@ -98,7 +98,7 @@ class Work(matrix.Plan):
 
 @dataclass(frozen=True)
 class Driven:
-    """What the store holds of the claims."""
+    """The stored episodes of the claims."""
 
     arms: Mapping[str, Arms]  # claim -> its arms
     notes: Mapping[str, Mapping[str, str]]  # `units` and `better` of the figures
@@ -131,7 +131,7 @@ def planned(claims: Sequence[Claim], settings: Settings) -> Work:
 
 
 def drive(claims: Sequence[Claim], settings: Settings) -> Driven:
-    """Drive what the store does not hold yet. What has no trained weights is left out and named on stderr.
+    """Drive the missing episodes. Policies without trained weights are skipped and named on stderr.
 
     Raises BadInput (nothing is driven then) and CosimError as `cosim evaluate` does.
     """
@@ -147,7 +147,7 @@ def drive(claims: Sequence[Claim], settings: Settings) -> Driven:
 
 
 def held(claims: Sequence[Claim], settings: Settings) -> Driven:
-    """What there is of the claims; nothing is driven. Raises BadInput as `drive`."""
+    """The stored episodes of the claims, without driving. Raises BadInput as `drive`."""
     work = planned(claims, settings)
     with opened(work, settings) as store:
         return _found(work, store)
@@ -166,7 +166,7 @@ def opened(work: Work, settings: Settings) -> Iterator[Store]:
         store.extend(
             [{"cell": c.name, "case": c.case.document(), "manifest": dict(c.manifest)} for c in work.cells]
         )
-        for cell in work.cells:  # another Python drives on
+        for cell in work.cells:  # another version of Python is allowed
             if cell.name in known and known[cell.name]["manifest"]["versions"] != cell.manifest["versions"]:
                 store.set_manifest(cell.name, known[cell.name]["manifest"] | cell.manifest)
         if taken := kept.take(store, work.wanted, settings.kept):
@@ -175,7 +175,7 @@ def opened(work: Work, settings: Settings) -> Iterator[Store]:
 
 
 def engine(settings: Settings) -> Engine:
-    """Who spreads the episodes over processes or machines. Raises BadInput: ray is not installed."""
+    """The engine of the drives. Raises BadInput when ray is not installed."""
     if settings.engine == "local":
         return LocalEngine(Runner, workers=settings.workers)
     from cosim.workers.ray_engine import RayEngine
@@ -187,12 +187,12 @@ class Runner(EpisodeRunner):
     """Hosted by the engine: as `cosim evaluate` drives, for policies whose name has a mark."""
 
     def policy(self, case: EpisodeOptions) -> str:
-        """The name that `--policy` knows."""
+        """The policy's name for `--policy`."""
         return kept.unmarked(case.policy)
 
 
 def policy(cell: matrix.Cell) -> str:
-    """Who drives the cell, by the name that `--policy` knows."""
+    """The cell's policy, by its name for `--policy`."""
     return kept.unmarked(cell.case.policy)
 
 
@@ -201,13 +201,13 @@ def policy(cell: matrix.Cell) -> str:
 
 @cache
 def _made_of(name: str) -> tuple[tuple[Path, ...], str]:
-    """The files that decide how a policy drives, and what is to be warned of."""
+    """The policy's weights and code files, and its label."""
     made = make(name)
     return tuple(getattr(made, "files", ())), str(getattr(made, "label", ""))
 
 
 def _arm(plain: matrix.Cell, seeds: range) -> Arm:
-    """The cell with the mark of what drives it."""
+    """The arm with the hash of its policy and definitions in the cell's name."""
     paths, label = _made_of(plain.case.policy)
     files = digests([*paths, *code.files_of([*plain.case.metrics, plain.case.reward])])
     about = {**plain.manifest, POLICY_FILES: files}

@@ -1,4 +1,4 @@
-"""What the episodes say of a claim: every figure with its interval, every pair tested, and one verdict.
+"""The evaluation of a claim: figures with intervals, tests of pairs, and one verdict.
 
 The statistics are those of `cosim compare`. Tests are corrected together, by Holm's method.
 """
@@ -49,7 +49,7 @@ class Line(NamedTuple):
 
 
 class Traffic(NamedTuple):
-    """What a row of a page says beside its figures."""
+    """The traffic of a row of a page."""
 
     preset: str
     errors: str  # of the human drivers
@@ -71,7 +71,7 @@ class Tested:
 
 @dataclass(frozen=True)
 class Found:
-    """All that a page says of a claim."""
+    """The complete evaluation of a claim."""
 
     claim: Claim
     arms: Arms
@@ -80,7 +80,7 @@ class Found:
 
     @property
     def verdict(self) -> Verdict:
-        """Of the claim: it holds everywhere, or somewhere, as the claim says."""
+        """The verdict of the claim, which must hold everywhere or somewhere."""
         verdicts = {one.verdict for one in self.tested}
         decisive: Verdict = "no" if self.claim.holds == "everywhere" else "yes"
         other: Verdict = "yes" if decisive == "no" else "no"
@@ -110,7 +110,7 @@ class Found:
         return figure(self.measures[metric], self.arms[condition, arm].rows)
 
     def difference(self, condition: Condition, against: str, metric: str) -> PairedFigure:
-        """The claim's arm less another one, on equal seeds."""
+        """The claim's arm minus another arm, on equal seeds."""
         both = (self.arms[condition, arm] for arm in (against, self.claim.compare.arm))
         return paired(self.measures[metric], pairs(*both))
 
@@ -177,7 +177,7 @@ def pairs(before: Arm, after: Arm) -> list[tuple[Row, Row]]:
 
 
 def figure(measure: Measure, rows: Sequence[Row]) -> Figure:
-    """A measure over the episodes that came through."""
+    """A measure over the completed episodes."""
     if measure.per:
         return measure.figure(_ok(rows))
     values = _known(measure, rows)
@@ -187,7 +187,7 @@ def figure(measure: Measure, rows: Sequence[Row]) -> Figure:
 
 
 def traffic_of(arm: Arm) -> Traffic:
-    """What the episodes of an arm say of their traffic."""
+    """The traffic of an arm's episodes."""
     row = arm.rows[0]
     return Traffic(str(row["preset"]), str(row.get("errors") or "none"), str(row["behavior"]))
 

@@ -1,4 +1,4 @@
-"""The index of results, and whether every page is of the weights and definitions that are here."""
+"""The index of results, and the check that every page has the present weights and definitions."""
 
 from __future__ import annotations
 
@@ -51,9 +51,9 @@ def answer(claim: Claim, out: Path) -> str:
 
 
 def stale(claim: Claim, work: Work, out: Path) -> Iterator[str]:
-    """Why the claim's pages are not of the weights and definitions that are here, a line each.
+    """Differences of the claim's pages from the present weights and definitions, a line each.
 
-    A page that this engine has not written yet is none of its business.
+    Pages not written by this engine are skipped.
     """
     page, arms = out / f"{claim.name}.md", work.arms[claim.name]
     if answer(claim, out) != NOT_DRIVEN:
@@ -68,7 +68,7 @@ def stale(claim: Claim, work: Work, out: Path) -> Iterator[str]:
 
 
 def _differing(page: Path, made: Mapping[Key, Mapping[str, str]], arms: Arms) -> Iterator[str]:
-    """What drives an arm now and did not when the page was made."""
+    """Arms with other weights or definitions than on the page."""
     for (condition, name), arm in arms.items():
         row = made.get((condition.scenario, condition.text, name))
         if row is None:
@@ -80,7 +80,7 @@ def _differing(page: Path, made: Mapping[Key, Mapping[str, str]], arms: Arms) ->
 
 
 def _made(out: Path, name: str) -> dict[Key, dict[str, str]]:
-    """A row of the page's CSV for every arm and condition; none where this engine has not written it."""
+    """A row of the page's CSV for every arm and condition; empty if not written by this engine."""
     table = out / "data" / f"{name}.csv"
     if not table.is_file():
         return {}

@@ -1,7 +1,7 @@
-"""The episodes that come with the repository: what a page needs and was driven already is taken from here.
+"""The episodes stored in the repository, reused for pages.
 
-An exported run like any other (`episodes.parquet`, `manifest.json`; `cosim.report.run_folder` reads it),
-but for what belongs to the machine that drove it. A row is taken only for the very cell it was driven for.
+An exported run (`episodes.parquet`, `manifest.json`, readable by `cosim.report.run_folder`) without
+machine-dependent columns. A row is reused only for exactly its cell.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ from cosim.workers.tasks import OK
 
 FOLDER = Path("docs/results/episodes")
 ROWS, MANIFEST = "episodes.parquet", "manifest.json"
-LEVEL = 19  # of zstd: written seldom
-MARK = "#"  # between a policy's name and the hash of what makes the episode
-OF_THE_MACHINE = ("timings", "stderr", "attempts")  # and every timing: not the same again
+LEVEL = 19  # of zstd: high, because files are rarely written
+MARK = "#"  # between a policy's name and the hash of its definitions
+OF_THE_MACHINE = ("timings", "stderr", "attempts")  # and every timing: not reproducible
 
 
 def episodes(folder: Path | None) -> Run:
-    """What is kept; no rows where nothing is. Raises BadInput when the files are not ours."""
+    """The kept episodes, possibly none. Raises BadInput for foreign files."""
     if folder is None or not (folder / ROWS).is_file():
         return Run(Path(), [])
     return _read(folder, (folder / ROWS).stat().st_mtime_ns)
 
 
 def take(store: Store, wanted: Mapping[str, Container[int]], folder: Path | None) -> int:
-    """Put into the store what it lacks of the `wanted` seeds (by cell) and is kept; how many were taken.
+    """Copy kept episodes of the `wanted` seeds (by cell) that the store lacks; returns their number.
 
-    The store knows these cells.
+    The store must contain these cells.
     """
     found, known = episodes(folder), store.keys()
     rows = [
@@ -53,9 +53,9 @@ def take(store: Store, wanted: Mapping[str, Container[int]], folder: Path | None
 
 
 def keep(store: Store, wanted: Mapping[str, Container[int]], folder: Path) -> int:
-    """Write what the store holds of the wanted episodes and came through; how many.
+    """Write the completed wanted episodes of the store; returns their number.
 
-    What was kept and is not wanted any more goes; `opened` has put the rest into the store.
+    Kept episodes that are no longer wanted are removed; `opened` has copied the others into the store.
     """
     rows = [row for row in store.rows() if row["status"] == OK and row["seed"] in wanted.get(row["cell"], ())]
     present, cells, document = {row["cell"] for row in rows}, store.cells(), store.document()
@@ -70,7 +70,7 @@ def keep(store: Store, wanted: Mapping[str, Container[int]], folder: Path) -> in
 
 
 def write(rows: Sequence[Row], manifest: Mapping[str, Any], folder: Path) -> None:
-    """The rows, by cell and seed, with the manifest; each file whole or not at all."""
+    """Write the rows, by cell and seed, and the manifest, each file atomically."""
     folder.mkdir(parents=True, exist_ok=True)
     place = {name: k for k, name in enumerate(manifest["cells"])}
     table = arrow([plain(row) for row in sorted(rows, key=lambda r: (place[r["cell"]], r["seed"]))])
@@ -80,18 +80,18 @@ def write(rows: Sequence[Row], manifest: Mapping[str, Any], folder: Path) -> Non
 
 
 def plain(row: Row) -> dict[str, Any]:
-    """The row without what belongs to the machine that drove it: equal whenever it is driven anew."""
+    """The row without machine-dependent columns: equal whenever it is driven again."""
     timings = json.loads(row.get("timings") or "{}")
     return {name: value for name, value in row.items() if name not in (*OF_THE_MACHINE, *timings)}
 
 
 def packages(versions: Mapping[str, str | None]) -> dict[str, str]:
-    """The versions that decide how an episode is driven: not Python's own, and no local label (`+cpu`)."""
+    """The versions that affect an episode: without Python's, and without local labels (`+cpu`)."""
     return {name: (version or "").partition("+")[0] for name, version in versions.items() if name != "python"}
 
 
 def unmarked(text: str) -> str:
-    """The name that `--policy` knows, of the policy of a cell."""
+    """The name for `--policy` of a cell's policy."""
     return text.partition(MARK)[0]
 
 

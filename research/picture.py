@@ -1,4 +1,4 @@
-"""The one picture of a page: the primary figure by arm and scenario, or a front of who pays and who gains."""
+"""The picture of a page: the primary figure by arm and scenario, or a front of gains against costs."""
 
 from __future__ import annotations
 

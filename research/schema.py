@@ -1,4 +1,4 @@
-"""A claim as a file: `research/claims/NAME.yaml`, read and checked before anything is driven.
+"""A claim as a file: `research/claims/NAME.yaml`, read and checked before the first episode.
 
 An arm is a mapping of options (`cosim.scenario.options.OPTIONS`, by the names of SPEC.yaml) over those that
 all arms share. Every arm is driven in every condition: a scenario with one value of each option in `matrix`.
@@ -29,7 +29,7 @@ OF_AN_ARM = tuple(name for name in OPTIONS if name != SCENARIO)  # options that 
 
 
 class Condition(NamedTuple):
-    """The traffic that all arms drive in: a scenario, and a value of every option in the matrix."""
+    """The traffic of all arms: a scenario, and a value of every option in the matrix."""
 
     scenario: str
     values: tuple[tuple[str, Any], ...] = ()
@@ -46,12 +46,12 @@ class Seeds:
 
     first: int
     count: int
-    more: Mapping[str, int] = field(default_factory=dict)  # scenario -> count, where it is another one
+    more: Mapping[str, int] = field(default_factory=dict)  # scenario -> count, if different
 
 
 @dataclass(frozen=True)
 class Compare:
-    """The arm that the claim is about, and each of those that it is compared with, on equal seeds."""
+    """The arm of the claim and the arms compared with it, on equal seeds."""
 
     arm: str
     against: tuple[str, ...]
@@ -59,20 +59,20 @@ class Compare:
 
 @dataclass(frozen=True)
 class Primary:
-    """The figure that the claim is about, by its name in reports, and the way the arm is said to differ."""
+    """The figure of the claim, by its name in reports, and the claimed direction."""
 
     metric: str
     direction: Literal["lower", "higher"]
 
     @property
     def sign(self) -> float:
-        """Of the difference that the claim expects."""
+        """The sign of the claimed difference."""
         return 1.0 if self.direction == "higher" else -1.0
 
 
 @dataclass(frozen=True)
 class Power:
-    """The smallest effect of interest, in the metric's unit (shares: a fraction), and the pairs it needs."""
+    """The smallest effect of interest, in the metric's unit (shares: a fraction), and the required pairs."""
 
     smallest: Positive
     pairs: int
@@ -80,13 +80,13 @@ class Power:
 
 @dataclass(frozen=True)
 class Claim:
-    """One claim: all that decides what is driven, what is tested and what the page says.
+    """One claim: the definition of its episodes, tests and page.
 
     Raises BadInput naming the field and the value.
     """
 
     name: str  # of the file, the page and the CSV
-    sentence: str  # what is claimed; the page answers yes, no or not resolved
+    sentence: str  # the claim; the page answers yes, no or not resolved
     source: str  # paper and figure
     scenarios: tuple[str, ...]
     seeds: Seeds
@@ -95,14 +95,14 @@ class Claim:
     primary: Primary
     test: Literal["mcnemar", "signed_rank"]  # of cosim.report.statistics
     power: Power
-    holds: Literal["everywhere", "somewhere"] = "everywhere"  # in which comparisons the claim must hold
+    holds: Literal["everywhere", "somewhere"] = "everywhere"  # comparisons in which the claim must hold
     options: Mapping[str, Any] = field(default_factory=dict)  # of all arms
     matrix: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)  # option -> its values
-    floors: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # arms beside, without a test
+    floors: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # additional arms without a test
     secondary: tuple[str, ...] = ()  # metrics
     published: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # scenario -> arm -> value
     front: tuple[str, ...] = ()  # metrics: the picture draws each of the others against the first
-    note: str = ""  # what a reader of the page must know
+    note: str = ""  # a remark for the page
 
     def __post_init__(self) -> None:
         for scenario in (*self.scenarios, *self.published, *self.seeds.more):
@@ -178,7 +178,7 @@ class Claim:
 
 
 def names(folder: Path = FOLDER) -> list[str]:
-    """The claims that there are."""
+    """The names of all claims."""
     return sorted(path.stem for path in folder.glob("*.yaml"))
 
 
@@ -191,7 +191,7 @@ def read(path: Path) -> Claim:
 
 
 def chosen(wanted: Iterable[str], folder: Path = FOLDER) -> Iterator[Claim]:
-    """The claims of these names; all of them where none is named. Raises BadInput."""
+    """The claims of these names; all if none is named. Raises BadInput."""
     known = names(folder)
     for name in [*wanted] or known:
         one_of(name, known, "NAME")

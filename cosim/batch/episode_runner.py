@@ -1,4 +1,4 @@
-"""What a batch hosts in its worker processes: any episode, one after another, in one process."""
+"""The hosted object of a batch's worker processes: consecutive episodes in one process."""
 
 import math
 from dataclasses import replace
@@ -26,7 +26,7 @@ class EpisodeRunner(Hosts):
         return host.run(case.seed, progress, outputs=case.outputs, folder=folder).document()
 
     def policy(self, case: EpisodeOptions) -> str | Policy:
-        """Who commands the AVs of `case`: a name that `--policy` knows, unless a subclass says otherwise."""
+        """The policy of `case`: a name for `--policy`, unless a subclass overrides it."""
         return case.policy
 
     def open(self, case: EpisodeOptions, warnings: tuple[str, ...]) -> Host:

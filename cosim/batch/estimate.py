@@ -1,4 +1,4 @@
-"""How long a matrix will take: a few short episodes of it are driven, and the rest is computed from them."""
+"""Estimated wall time of a matrix, extrapolated from a few short episodes."""
 
 import itertools
 from collections.abc import Sequence
@@ -9,13 +9,13 @@ from statistics import fmean
 from cosim.batch.matrix import Cell, Plan
 from cosim.workers.engines import Engine
 
-PROBES = 8  # cells at most: a dry run should stay a matter of seconds
-PROBE = 4.0  # counted s per probe: ten decisions
+MAX_PROBES = 8  # cells; limits a dry run to seconds
+PROBE_TIME = 4.0  # counted s per probe: ten decisions
 
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """What one cell costs, in s of wall time."""
+    """The cost of one cell, in s of wall time."""
 
     start: float  # once per worker: net, policy, compiled code
     reset: float  # once per episode, warm-up included
@@ -23,26 +23,26 @@ class Cost:
 
 
 def estimate(plan: Plan, engine: Engine, workers: int) -> tuple[float | None, str]:
-    """Wall time of a whole matrix in s (None: no probe came through), and what it rests on.
+    """Wall time of a whole matrix in s (None: every probe failed), and the basis of the estimate.
 
-    The first seed of some cells is driven for `PROBE` s each, and the rest is computed from them.
-    A cell that was not probed is taken to cost what those of the same policy do. Traffic that grows during an
-    episode makes the estimate too low, an early end by a crash makes it too high.
+    The first seed of some cells is driven for `PROBE_TIME` s each and extrapolated. A cell without a probe
+    gets the mean cost of its policy. The estimate is too low for traffic that grows during an episode, and
+    too high for episodes that end early by a crash.
     """
     costs = probe(_chosen(plan.cells), engine)
     if not costs:
         return None, "no short episode came through: see the rows' errors in a real run"
     driven = [(cell.scenario.duration, _like(cell, costs)) for cell in plan.cells if cell.refused is None]
     total = sum(cost.start + len(plan.seeds) * (cost.reset + cost.second * s) for s, cost in driven)
-    basis = f"{len(costs)} of {len(plan.cells)} cells driven for {PROBE:g} s just now, {workers} workers"
+    basis = f"{len(costs)} of {len(plan.cells)} cells driven for {PROBE_TIME:g} s just now, {workers} workers"
     return total / workers, basis
 
 
 def probe(cells: Sequence[Cell], engine: Engine) -> dict[tuple[str, str], Cost]:
-    """(world or file, policy) -> cost, of those cells whose short episode came through."""
+    """(scenario, policy) -> cost, for cells with a completed probe."""
     tasks = {}
     for cell in cells:
-        case = replace(cell.case, duration=min(PROBE, cell.scenario.duration), outputs=())
+        case = replace(cell.case, duration=min(PROBE_TIME, cell.scenario.duration), outputs=())
         tasks[case.key] = cell, replace(cell, case=case).task(case)
     costs = {}
     with closing(engine.run([task for _, task in tasks.values()])) as outcomes:
@@ -61,17 +61,17 @@ def probe(cells: Sequence[Cell], engine: Engine) -> dict[tuple[str, str], Cost]:
 
 
 def _chosen(cells: Sequence[Cell]) -> list[Cell]:
-    """One cell of each world and policy, those of different policies first."""
+    """One cell of each scenario and policy, different policies first."""
     found: dict[str, dict[str, Cell]] = {}
     for cell in cells:
         if cell.refused is None:
             found.setdefault(cell.case.policy, {}).setdefault(cell.case.what, cell)
     rounds = itertools.zip_longest(*(worlds.values() for worlds in found.values()))
-    return [cell for mixed in rounds for cell in mixed if cell is not None][:PROBES]
+    return [cell for mixed in rounds for cell in mixed if cell is not None][:MAX_PROBES]
 
 
 def _like(cell: Cell, costs: dict[tuple[str, str], Cost]) -> Cost:
-    """The cost of the same world and policy, else the mean of the policy, else of all."""
+    """The cost of the same scenario and policy, else the mean of the policy, else of all."""
     if known := costs.get((cell.case.what, cell.case.policy)):
         return known
     alike = [cost for (_, policy), cost in costs.items() if policy == cell.case.policy] or [*costs.values()]

@@ -1,4 +1,4 @@
-"""The straight path of a batch: what is left to do -> engine -> row -> store, one episode at a time."""
+"""The execution of a batch: missing episodes -> engine -> row -> store, one episode at a time."""
 
 from collections.abc import Mapping
 from contextlib import closing
@@ -16,7 +16,7 @@ from cosim.scenario.policy_name import label
 from cosim.workers.engines import Engine
 from cosim.workers.tasks import BAD_INPUT, FAULT, Outcome, Progress
 
-FAULTS = 10  # of our own code, before a batch stops: it is broken, not unlucky
+MAX_FAULTS = 10  # internal errors before a batch stops
 
 
 def asked(folder: Path, url: str | None) -> tuple[list[EpisodeOptions], range]:
@@ -33,9 +33,9 @@ def asked(folder: Path, url: str | None) -> tuple[list[EpisodeOptions], range]:
 
 
 def begin_or_resume(plan: Plan, store: Store, document: Mapping[str, Any], *, resume: bool) -> None:
-    """Begin a fresh store with this plan; check that one in use was begun with it.
+    """Begin a fresh store with this plan, or check that an existing store has the same plan.
 
-    Raises BadInput when it was begun with another plan, or was begun at all and `resume` is false.
+    Raises BadInput for a store with another plan, or an existing store without `resume`.
     """
     if store.spec_hash() is None:
         begin(plan, store, document)
@@ -47,9 +47,9 @@ def begin_or_resume(plan: Plan, store: Store, document: Mapping[str, Any], *, re
 
 
 def begin_or_grow(plan: Plan, store: Store, document: Mapping[str, Any], *, resume: bool) -> None:
-    """As `begin_or_resume`, but a run may go on to further seeds than it was begun with.
+    """As `begin_or_resume`, but a resumed run may have additional seeds.
 
-    Raises BadInput as that does, and when it holds seeds that the plan does not.
+    Raises BadInput also when the store holds seeds outside of the plan.
     """
     if not resume or store.spec_hash() is None:
         begin_or_resume(plan, store, document, resume=resume)
@@ -63,7 +63,7 @@ def begin_or_grow(plan: Plan, store: Store, document: Mapping[str, Any], *, resu
 
 
 def begin(plan: Plan, store: Store, document: Mapping[str, Any]) -> None:
-    """Write down in a fresh store what is to be run. `document`: what the manifest shall say of it."""
+    """Store the plan in a fresh store. `document`: content for the manifest."""
     cells = [
         {"cell": cell.name, "case": cell.case.document(), "manifest": dict(cell.manifest)}
         for cell in plan.cells
@@ -73,7 +73,7 @@ def begin(plan: Plan, store: Store, document: Mapping[str, Any]) -> None:
 
 
 def check_same(plan: Plan, store: Store) -> None:
-    """Raises BadInput unless the store was begun with this very plan, on the same files and versions."""
+    """Raises BadInput unless the store has this plan, with the same files and versions."""
     if store.spec_hash() != plan.spec_hash:
         problem = "holds the run of another spec: name another folder, or no spec to go on with its own"
         raise BadInput(problem, field="--resume")
@@ -83,16 +83,16 @@ def check_same(plan: Plan, store: Store) -> None:
 
 
 def drive(plan: Plan, store: Store, engine: Engine, outputs: Path, progress: Progress) -> list[Outcome]:
-    """Run every episode that the store does not hold yet, and keep each as it comes.
+    """Run every missing episode and store each result at once.
 
-    Returns those at which our own code failed: they have no row, so that a resumed run tries them again.
+    Returns the episodes with internal errors. They have no row, so a resumed run tries them again.
 
     `outputs`: folder of SUMO's own outputs, one folder per episode in it. The engine hosts an object whose
     `run(case, warnings, outputs)` returns the document of `cosim run --json`.
 
     Raises:
         BadInput: a worker saw other files or versions than the plan did.
-        CosimError: the store cannot be written any more, or our own code failed `FAULTS` times.
+        CosimError: the store cannot be written any more, or `MAX_FAULTS` internal errors.
     """
     done = store.keys()
     cases = {case.key: (cell, case) for cell, case in plan.cases() if case.key not in done}
@@ -115,20 +115,20 @@ def drive(plan: Plan, store: Store, engine: Engine, outputs: Path, progress: Pro
                 store.add([row(cell, case, outcome)])
                 continue
             faults.append(outcome)
-            if len(faults) == FAULTS:
-                raise CosimError(f"stopped at the {FAULTS}th fault of our own: {outcome.stderr}")
+            if len(faults) == MAX_FAULTS:
+                raise CosimError(f"stopped at the {MAX_FAULTS}th fault of our own: {outcome.stderr}")
     return faults
 
 
 def manifest(plan: Plan, store: Store) -> dict[str, Any]:
-    """manifest.json: what was run, on what; per cell what `cosim.scenario.manifest` says of all."""
+    """manifest.json: plan and versions, and `cosim.scenario.manifest` of every cell."""
     cells = store.cells()
     versions: dict[str, Any] = next((cell["manifest"]["versions"] for cell in cells.values()), {})
     return {**store.document(), "spec": plan.spec_hash, "versions": versions, "cells": cells}
 
 
 class _Common:
-    """What all episodes of a cell have in common: kept once, and compared with every episode."""
+    """The common part of all episodes of a cell: stored once, and compared with every episode."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
@@ -150,7 +150,7 @@ class _Common:
 
 
 def _compare(known: Mapping[str, Any], found: Mapping[str, Any], cell: Cell, where: str) -> None:
-    """Equal in all that both name: the planner does not know what only a worker can."""
+    """Compare the common fields: some are known to workers only."""
     for name in known.keys() & found.keys():
         a, b = known[name], found[name]
         if isinstance(a, Mapping) and isinstance(b, Mapping):

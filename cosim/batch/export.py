@@ -1,4 +1,4 @@
-"""What a run leaves for others to read: episodes as Parquet and CSV, the manifest, the summary."""
+"""Exported files of a run: episodes as Parquet and CSV, the manifest, the summary."""
 
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -19,7 +19,7 @@ Row = Mapping[str, Any]
 def export(
     folder: Path, rows: Sequence[Row], manifest: Mapping[str, Any], summary: Mapping[str, Any]
 ) -> None:
-    """Write `episodes.parquet`, `episodes.csv`, `manifest.json`, `summary.json`; each whole or not at all.
+    """Write `episodes.parquet`, `episodes.csv`, `manifest.json`, `summary.json`, each atomically.
 
     Raises:
         CosimError: the folder cannot be written any more; the store still holds everything.

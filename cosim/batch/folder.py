@@ -10,7 +10,7 @@ from cosim.errors import BadInput
 from cosim.files import cannot, lock
 
 EPISODE_BYTES = 32_000  # 6 kB in the store, 2 kB exported, and the store's log beside it
-LEAST_BYTES = 4_000_000  # bytes
+MIN_BYTES = 4_000_000  # bytes
 RESULTS = (FILE, "episodes.parquet", "episodes.csv", "summary.json", "manifest.json")
 
 
@@ -32,19 +32,19 @@ class RunFolder(contextlib.AbstractContextManager["RunFolder"]):
             held = [name for name in RESULTS if (self.path / name).exists()]
             if held and not resume:
                 raise self._wrong(f"holds {held[0]} already: go on with --resume, or name another folder")
-            self._check_space(max(episodes * EPISODE_BYTES, LEAST_BYTES))
+            self._check_space(max(episodes * EPISODE_BYTES, MIN_BYTES))
         except BaseException:
             self._remove_made()
             raise
 
     def undo(self) -> None:
-        """Nothing was run after all: leave the place as it was found (not after `resume`)."""
+        """Remove what was created, when nothing was run (not after `resume`)."""
         for name in (FILE, f"{FILE}-wal", f"{FILE}-shm"):
             (self.path / name).unlink(missing_ok=True)
         self._remove_made()
 
     def close(self) -> None:
-        """Give up the lock."""
+        """Release the lock."""
         if self._lock is not None:
             os.close(self._lock)
             self._lock = None
@@ -53,7 +53,7 @@ class RunFolder(contextlib.AbstractContextManager["RunFolder"]):
         self.close()
 
     def _make(self) -> list[Path]:
-        """Make it; the folders that were not there before, innermost first."""
+        """Create the folder; returns the created folders, innermost first."""
         missing: list[Path] = []
         try:
             missing += [folder for folder in (self.path, *self.path.parents) if not folder.exists()]
@@ -73,7 +73,7 @@ class RunFolder(contextlib.AbstractContextManager["RunFolder"]):
                 folder.rmdir()
 
     def _check_space(self, size: int) -> None:
-        """Write and remove a file of the size that the results may reach."""
+        """Check the free space with a temporary file of the results' largest size."""
         probe = self.path / ".space.part"
         with self._cannot(f"hold the results ({size / 1e6:.0f} MB at most)"):
             try:

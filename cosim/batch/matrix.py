@@ -1,4 +1,4 @@
-"""The matrix of a spec: every cell loaded and vetted before anything is run."""
+"""The matrix of a spec: every cell is loaded and vetted before the first episode."""
 
 import hashlib
 import itertools
@@ -20,17 +20,17 @@ from cosim.scenario.vet import vetted
 from cosim.types import Traffic
 from cosim.workers.tasks import Task
 
-CheckPolicy = Callable[[str], None]  # raises BadInput for a name that is none
+CheckPolicy = Callable[[str], None]  # raises BadInput for an unknown name
 
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """Cases that differ in nothing but the seed."""
+    """Cases that differ in the seed only."""
 
     case: EpisodeOptions  # of the first seed
     scenario: Scenario  # vetted unless `refused`
     manifest: Mapping[str, Any]  # `cosim.scenario.manifest` without the seed
-    refused: str | None = None  # why SUMO must not see this net: every episode of the cell is bad_input
+    refused: str | None = None  # reason why the net must not be loaded: all episodes are bad_input
 
     @property
     def name(self) -> str:
@@ -46,7 +46,7 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """All that is to be run: cells times seeds, in this order."""
+    """All planned episodes: cells times seeds, in this order."""
 
     cells: tuple[Cell, ...]
     seeds: range
@@ -57,7 +57,7 @@ class Plan:
 
     @property
     def spec_hash(self) -> str:
-        """SHA-256 of what is to be run, in whatever order and notation it was asked for."""
+        """SHA-256 of the planned episodes, independent of order and notation in the spec."""
         text = json.dumps([sorted(cell.case.text() for cell in self.cells), self.seeds[0], self.seeds[-1]])
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -68,9 +68,9 @@ class Plan:
 
 
 def cells(spec: Spec) -> Iterator[EpisodeOptions]:
-    """The case of every cell's first seed; each once, though one policy may have one preset only.
+    """The case of every cell's first seed, without duplicates from policies that have a single preset.
 
-    Cells with and without AVs are compared: traffic is controlled in all of them if cosim drives in one.
+    Cells with and without AVs are compared, so traffic is controlled in all of them if cosim drives in one.
     """
     found = [*dict.fromkeys(map(with_preset, spec.options()))]
     if "traffic" not in spec.values and any(map(drives, found)):
@@ -84,7 +84,7 @@ def cells(spec: Spec) -> Iterator[EpisodeOptions]:
 
 
 def drives(case: EpisodeOptions) -> bool:
-    """Whether cosim may drive a vehicle where the scenario's own file does not say so."""
+    """Whether cosim may drive a vehicle that the scenario's own files do not make an AV."""
     return bool(driven(case.fleet, case.behavior, case.errors))
 
 
@@ -94,8 +94,8 @@ def plan(cases: Iterable[EpisodeOptions], seeds: range, check_policy: CheckPolic
     A net that would kill SUMO costs its own cells only: they become `refused`.
 
     Raises:
-        BadInput: anything else that is wrong with a cell: an unknown policy, demand or output, a demand file
-            that is malformed or whose edges are not in the net, a vehicle type that is not there.
+        BadInput: any other fault of a cell: an unknown policy, demand, output or vehicle type, or a demand
+            file that is malformed or uses edges outside of the net.
     """
     found = []
     worlds: dict[EpisodeOptions, tuple[Scenario, Mapping[str, Any], str | None]] = {}
@@ -105,7 +105,7 @@ def plan(cases: Iterable[EpisodeOptions], seeds: range, check_policy: CheckPolic
             code.read(metric, "--metric").load("--metric")
         if case.reward is not None:
             read_reward(case.reward)
-        world = replace(case, policy="", svo_deg=0.0, seed=seeds[0])  # who drives changes nothing of it
+        world = replace(case, policy="", svo_deg=0.0, seed=seeds[0])  # independent of the policy
         if world not in worlds:
             worlds[world] = _read(world)
         found.append(Cell(replace(case, seed=seeds[0]), *worlds[world]))
@@ -113,7 +113,7 @@ def plan(cases: Iterable[EpisodeOptions], seeds: range, check_policy: CheckPolic
 
 
 def check_names(plan: Plan) -> None:
-    """Raises BadInput when two worlds of the plan would have one name in rows, reports and comparisons."""
+    """Raises BadInput when two scenarios of the plan have the same name in rows, reports, comparisons."""
     places: dict[str, str] = {}
     for cell in plan.cells:
         name, what = cell.scenario.name, cell.case.what
@@ -123,7 +123,7 @@ def check_names(plan: Plan) -> None:
 
 
 def _read(case: EpisodeOptions) -> tuple[Scenario, Mapping[str, Any], str | None]:
-    """The scenario, vetted unless its net is refused; its manifest without the seed; why it is refused."""
+    """The scenario, vetted unless refused; its manifest without the seed; the reason of a refusal."""
     scenario = case.scenario()
     sumo_outputs.check(case.outputs, scenario.options)
     refused = None

@@ -1,4 +1,4 @@
-"""`cosim record`: drives episodes on worker processes and keeps what every vehicle did."""
+"""`cosim record`: drives episodes on worker processes and records every vehicle."""
 
 import hashlib
 import sys
@@ -32,7 +32,7 @@ def planned(seeds: range, **written: Any) -> Plan:
 
 
 class RecordingRunner(EpisodeRunner):
-    """Drives episodes of any cell, one after another, and writes each to the folder."""
+    """Drives episodes of any cell and writes each to the folder."""
 
     def __init__(self, folder: str) -> None:
         super().__init__()
@@ -59,9 +59,9 @@ def record(
     command: Sequence[str] = (),
     quiet: bool = False,
 ) -> list[str]:
-    """Drive the plan's episodes into `out`; returns those that could not be driven, with why.
+    """Record the plan's episodes in `out`; returns failed episodes with their reasons.
 
-    Episodes that are there already are left out when `resume` is given; without it they are BadInput.
+    Existing episodes are skipped with `resume`; without it they raise BadInput.
     """
     folder = Folder(out)
     if folder.manifest_file.is_file() and not resume:
@@ -82,7 +82,7 @@ def record(
 
 
 def _manifest(folder: Folder, plan: Plan, command: Sequence[str]) -> dict[str, Any]:
-    """What is recorded from what; joined with what an earlier call left. Raises BadInput when the files of a
+    """The sources of the recordings, merged with an earlier manifest. Raises BadInput when the files of a
     cell have changed since."""
     before: dict[str, Any] = folder.manifest() if folder.manifest_file.is_file() else {}
     known = dict(before.get("cells", {}))

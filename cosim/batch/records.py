@@ -1,4 +1,4 @@
-"""One flat row per episode: the columns of `cosim run --json`, and what became of the episode. NA is None."""
+"""One flat row per episode: the columns of `cosim run --json`, and the episode's status. NA is None."""
 
 import json
 from collections.abc import Iterable, Mapping
@@ -13,7 +13,7 @@ from cosim.workers.tasks import Outcome
 
 FIRST = ("key", "cell", "status", *IDENTITY)  # in every table; then the order of `cosim run --json`
 LAST = ("error", "stderr", "attempts")
-_NESTED = ("units", "better", "manifest")  # the same for all episodes of a cell: kept once, in the manifest
+_NESTED = ("units", "better", "manifest")  # equal for all episodes of a cell: stored once, in the manifest
 _AS_TEXT = (
     *("timings", "collision_list", "not_comparable_because"),
     *("interventions_by_reason", "human_errors_by_kind", "human_error_list", "tilt_trials"),
@@ -21,7 +21,7 @@ _AS_TEXT = (
 
 
 def row(cell: Cell, case: EpisodeOptions, outcome: Outcome) -> dict[str, Any]:
-    """The row of one outcome, whose value is the document of `cosim run --json`."""
+    """The row of one outcome with the document of `cosim run --json` as value."""
     named = cell.scenario.identity(label(case.policy), None, case.svo_deg, case.seed)
     found = {"key": case.key, "cell": cell.name, "status": outcome.status, **asdict(named), **case.columns}
     if outcome.ok:

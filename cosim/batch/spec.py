@@ -1,4 +1,4 @@
-"""What to evaluate, as a user writes it: SPEC.yaml and the flags of `cosim evaluate`, read into a `Spec`."""
+"""The specification of an evaluation: SPEC.yaml and the flags of `cosim evaluate`, read into a `Spec`."""
 
 import glob
 import itertools
@@ -19,7 +19,7 @@ from cosim.scenario.options import FLEET, OPTIONS, EpisodeOptions, Option
 from cosim.seeding import FIRST_TEST_SEED
 
 MAX_SEED = 2**62
-MAX_EPISODES = 1_000_000  # more is a slip of the keyboard: 3 GB of rows
+MAX_EPISODES = 1_000_000  # a larger number is probably a typing error: 3 GB of rows
 SEEDS = "seeds"
 FIELDS = (*OPTIONS, SEEDS)
 _GLOB = re.compile(r"[*?\[]")
@@ -45,14 +45,14 @@ class Spec:
 
 
 def read(path: Path | None, flags: Mapping[str, Any]) -> Spec:
-    """The spec of a file, of flags, or of both: a flag that is given replaces that axis of the file.
+    """The spec of a file, of flags, or of both: a flag replaces that axis of the file.
 
-    `flags`: by the names of `Spec`, None where not given; values as typed (`seeds` as "a:b", `demand` as
-    names, paths and globs). Relative paths of the file are relative to the file, those of flags to here.
+    `flags`: by the names of `Spec`, None if not given; values as typed (`seeds` as "a:b", `demand` as names,
+    paths and globs). Paths in the file are relative to the file, paths in flags to the working directory.
 
     Raises:
-        BadInput: unknown field (with the nearest name), wrong kind of value, a glob without a file, seeds
-            that are none, values that exclude one another.
+        BadInput: unknown field (with the nearest name), wrong kind of value, a glob without a file, invalid
+            seeds, values that exclude one another.
     """
     written = {} if path is None else document(path)
     with inside("", path):
@@ -111,9 +111,9 @@ def _values(option: Option, value: object, folder: Path, file: object, field: st
 
 
 def _expand(item: str, folder: Path, file: object, field: str, kind: str) -> Iterator[tuple[str, ...]]:
-    """The points of one axis that one item stands for.
+    """The points of one axis from one item.
 
-    A demand may be several files, joined by commas, and each of them a glob: every combination is a point.
+    A demand may be several files or globs, joined by commas: every combination is a point.
     """
     whole = is_there(folder / item)
     parts = [part.strip() for part in ([item] if whole or kind == "scenario" else item.split(","))]
@@ -121,7 +121,7 @@ def _expand(item: str, folder: Path, file: object, field: str, kind: str) -> Ite
 
 
 def _files(name: str, folder: Path, file: object, field: str) -> tuple[str, ...]:
-    """The files that match, sorted and absolute; a name that is neither file nor glob stays as it is."""
+    """The matching files, sorted and absolute; a name that is neither file nor glob is unchanged."""
     path = folder / os.path.expanduser(name)
     if sumo_scenarios.ships(name):
         return (name,)
@@ -139,7 +139,7 @@ def _files(name: str, folder: Path, file: object, field: str) -> tuple[str, ...]
 
 
 def _checked(spec: Spec, file: object) -> Spec:
-    """What can be said without opening a scenario."""
+    """The checks that need no scenario."""
     known = sumo_scenarios.shipped()
     for name in spec.values["what"]:
         if name not in known and not os.path.isabs(name):

@@ -1,8 +1,7 @@
-"""Where the rows of a run are kept as they come: one row per episode, exactly once, whatever is killed.
+"""The store of a run's rows: exactly one row per episode, written at once, safe against kills.
 
-SQLite in the run's folder by default (write-ahead log: a row is there whole or not at all, also after
-kill -9), or any database that SQLAlchemy reaches by URL. A database may hold
-many runs, each under its name.
+By default SQLite in the run's folder (the write-ahead log makes rows atomic, even under kill -9), or any
+database of SQLAlchemy by URL. A database may hold many runs, each under its name.
 """
 
 from __future__ import annotations
@@ -67,7 +66,7 @@ class Store(contextlib.AbstractContextManager["Store"]):
 
     Raises:
         BadInput: the database cannot be reached or written, before anything is kept.
-        CosimError: it cannot be written any more (disk full): what was kept is whole, --resume goes on.
+        CosimError: it cannot be written any more (disk full): stored rows are complete, --resume continues.
     """
 
     def __init__(self, url: str, run: str = "") -> None:
@@ -83,7 +82,7 @@ class Store(contextlib.AbstractContextManager["Store"]):
         return cls(f"sqlite:///{folder.absolute() / FILE}")
 
     def begin(self, spec_hash: str, document: Mapping[str, Any], cells: Sequence[Mapping[str, Any]]) -> None:
-        """Write down what is to be run. `cells`: `cell`, `case` and `manifest`, in the matrix's order."""
+        """Store the plan. `cells`: `cell`, `case` and `manifest`, in the matrix's order."""
         rows = [{"run": self.run, "place": i, **cell} for i, cell in enumerate(cells)]
         with self._writing() as connection:
             connection.execute(
@@ -93,7 +92,7 @@ class Store(contextlib.AbstractContextManager["Store"]):
                 connection.execute(_cells.insert(), rows)
 
     def extend(self, cells: Sequence[Mapping[str, Any]]) -> None:
-        """Write down further cells, as in `begin`, behind those that are there; known ones stay."""
+        """Append further cells, as in `begin`; known cells are unchanged."""
         known = self.cells()
         new = [cell for cell in cells if cell["cell"] not in known]
         rows = [{"run": self.run, "place": len(known) + i, **cell} for i, cell in enumerate(new)]
@@ -102,12 +101,12 @@ class Store(contextlib.AbstractContextManager["Store"]):
                 connection.execute(_cells.insert(), rows)
 
     def spec_hash(self) -> str | None:
-        """The hash of what this run was begun with; None when it was not begun."""
+        """The hash of this run's plan; None before `begin`."""
         found = self._read(sa.select(_runs.c.spec_hash).where(_runs.c.run == self.run))
         return found[0].spec_hash if found else None
 
     def document(self) -> dict[str, Any]:
-        """What `begin` wrote down."""
+        """The document passed to `begin`."""
         return dict(self._read(sa.select(_runs.c.document).where(_runs.c.run == self.run))[0].document)
 
     def cells(self) -> dict[str, dict[str, Any]]:
@@ -116,23 +115,23 @@ class Store(contextlib.AbstractContextManager["Store"]):
         return {row.cell: {"case": row.case, "manifest": row.manifest} for row in self._read(query)}
 
     def set_manifest(self, cell: str, manifest: Mapping[str, Any]) -> None:
-        """The manifest of a cell's episodes, as the workers saw it."""
+        """Store the manifest of a cell's episodes, as reported by the workers."""
         here = (_cells.c.run == self.run) & (_cells.c.cell == cell)
         with self._writing() as connection:
             connection.execute(_cells.update().where(here).values(manifest=dict(manifest)))
 
     def note(self, name: str, value: Any, spec_hash: str | None = None) -> None:
-        """Set one field of what `begin` wrote down, and the hash where that changes with it."""
+        """Set one field of the document, and optionally the hash."""
         values = {"document": {**self.document(), name: value}, "spec_hash": spec_hash or self.spec_hash()}
         with self._writing() as connection:
             connection.execute(_runs.update().where(_runs.c.run == self.run).values(**values))
 
     def keys(self) -> set[str]:
-        """The episodes that are done."""
+        """Keys of the finished episodes."""
         return {row.key for row in self._read(sa.select(_episodes.c.key).where(_episodes.c.run == self.run))}
 
     def add(self, rows: Iterable[Mapping[str, Any]]) -> None:
-        """Keep these rows, all of them or none. Raises CosimError when one is there already."""
+        """Store these rows, all or none. Raises CosimError for an existing row."""
         values = [
             {
                 "run": self.run,
@@ -150,7 +149,7 @@ class Store(contextlib.AbstractContextManager["Store"]):
                 connection.execute(_episodes.insert(), values)
 
     def rows(self) -> list[dict[str, Any]]:
-        """Every row, by the cell's place in the matrix and the seed."""
+        """Every row, ordered by cell and seed."""
         query = (
             sa.select(_episodes.c.row)
             .join(_cells, (_cells.c.run == _episodes.c.run) & (_cells.c.cell == _episodes.c.cell))
@@ -160,13 +159,13 @@ class Store(contextlib.AbstractContextManager["Store"]):
         return [dict(found.row) for found in self._read(query)]
 
     def remove(self) -> None:
-        """Forget this run; a database keeps the others."""
+        """Delete this run; other runs in a database remain."""
         with self._writing() as connection:
             for table in (_episodes, _cells, _runs):
                 connection.execute(table.delete().where(table.c.run == self.run))
 
     def close(self) -> None:
-        """Let go of the database."""
+        """Close the database connection."""
         self._engine.dispose()
 
     def __exit__(self, *error: object) -> None:
@@ -181,7 +180,7 @@ class Store(contextlib.AbstractContextManager["Store"]):
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[sa.Connection]:
-        """One transaction; what a database cannot do becomes one sentence."""
+        """One transaction; database errors become one sentence."""
         try:
             with self._engine.begin() as connection:
                 yield connection

@@ -1,8 +1,8 @@
 """The commands of the command line, in the order `cosim --help` shows them.
 
 The module of each has `add(commands)`, which registers one sub-command and its flags, and
-`work(args) -> int`, which runs it and returns the exit code. Only the module of the command that was asked
-for is imported, and what a command needs is imported inside `work`.
+`work(args) -> int`, which runs it and returns the exit code. Only the module of the requested command is
+imported, and its dependencies are imported inside `work`.
 """
 
 COMMANDS = (

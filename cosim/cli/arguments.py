@@ -1,4 +1,4 @@
-"""Flags and types of values that several commands share: argparse says what is wrong and exits with 2."""
+"""Flags and value types shared by several commands; argparse reports errors and exits with 2."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SubCommands = Any  # what ArgumentParser.add_subparsers returns: argparse keeps 
 
 
 def add(parser: Any, *flags: str, **changed: Any) -> None:
-    """Add these shared flags to a parser or a group of one.
+    """Add these shared flags to a parser or a group.
 
     `changed`: settings of `add_argument` that replace the shared ones, for all of `flags`.
     """
@@ -25,9 +25,9 @@ def add(parser: Any, *flags: str, **changed: Any) -> None:
 
 
 def options(parser: Any, *, matrix: bool = False, without: Collection[str] = (), **meanings: str) -> None:
-    """Add the flags of `cosim.scenario.options`, but for those `without`; None where not given.
+    """Add the flags of `cosim.scenario.options`, except `without`; None if not given.
 
-    `matrix`: whether the flags of its axes may be repeated. `meanings`: other helps, by the option's name.
+    `matrix`: whether the flags of axes may be repeated. `meanings`: replaced help texts by option name.
     """
     from cosim.scenario.options import OPTIONS
 
@@ -39,14 +39,14 @@ def options(parser: Any, *, matrix: bool = False, without: Collection[str] = (),
 
 
 def texts(parser: Any, flags: Mapping[str, tuple[str, str]], **settings: Any) -> None:
-    """Add flags that take a text: flag -> its metavar and help. `settings`: further ones for all of them."""
+    """Add flags with a text: flag -> its metavar and help. `settings`: shared settings."""
     for flag, (metavar, meaning) in flags.items():
         parser.add_argument(flag, metavar=metavar, help=meaning, **settings)
 
 
 @functools.cache
 def _shared() -> dict[str, dict[str, Any]]:
-    """Flag -> its settings. Made on demand: the names of behaviours are read from a file."""
+    """Flag -> its settings. Built on demand, because the names of behaviours are read from a file."""
     from cosim.scenario.options import OPTIONS
 
     return {option.flag: _settings(option) for option in OPTIONS.values()} | {
@@ -60,7 +60,7 @@ def _shared() -> dict[str, dict[str, Any]]:
 
 
 def _settings(option: Option) -> dict[str, Any]:
-    """What `add_argument` is told of it."""
+    """The arguments of `add_argument` for an option."""
     typed = {} if option.range is None else {"type": functools.partial(_number, option.range)}
     shown = {"choices": option.choices} if option.choices else {"metavar": option.metavar}
     return {"help": option.help} | shown | typed

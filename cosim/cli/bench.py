@@ -1,6 +1,6 @@
-"""`cosim bench`: measurements a reader can repeat.
+"""`cosim bench`: reproducible measurements.
 
-`predict`: the predictors against recorded episodes. `attribution`: which inputs a value network uses.
+`predict`: the predictors against recorded episodes. `attribution`: the effect of a value network's inputs.
 """
 
 import argparse
@@ -10,7 +10,7 @@ from cosim.scenario import BEHAVIORS
 from cosim.scenario.behaviors import AS_IS
 
 DEMANDS = ("dense", "contested")
-POLICIES = ("idm", "altruist-rule")  # no network: the pages outlive those that ship
+POLICIES = ("idm", "altruist-rule")  # without networks, so that the pages do not depend on shipped weights
 
 
 def add(commands: arguments.SubCommands) -> None:
@@ -21,8 +21,8 @@ def add(commands: arguments.SubCommands) -> None:
     predict = kinds.add_parser(
         "predict",
         help="position error, interval coverage and map error of the predictors",
-        description="Measure every predictor on recorded episodes; records what it needs itself unless "
-        "--recordings names a folder of `cosim record`. The first four flags may be repeated (all worlds).",
+        description="Measure every predictor on recorded episodes; records missing episodes unless "
+        "--recordings names a folder of `cosim record`. The first four flags may be repeated (default: all).",
     )
     arguments.add(predict, "--scenario", "--demand", "--behavior", "--policy", action="append", default=[])
     predict.add_argument(
@@ -42,7 +42,7 @@ def add(commands: arguments.SubCommands) -> None:
 
 
 def work(args: argparse.Namespace) -> int:
-    """Record where needed, measure, print the tables."""
+    """Record missing episodes, measure, print the tables."""
     import shlex
     import sys
     from pathlib import Path
@@ -114,7 +114,7 @@ def _add_attribution(kinds: arguments.SubCommands) -> None:
 
 
 def work_attribution(args: argparse.Namespace) -> int:
-    """Drive, ask, print the page."""
+    """Measure the attribution and print the page."""
     import shlex
     import sys
 

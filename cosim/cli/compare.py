@@ -58,7 +58,7 @@ def add(commands: arguments.SubCommands) -> None:
 
 
 def work(args: argparse.Namespace) -> int:
-    """Compare, show, and say by the exit code whether B passed."""
+    """Compare and show; the exit code reports whether B passed."""
     from cosim.report import verdict
     from cosim.report.compare import compare
     from cosim.report.pairing import chosen, side

@@ -1,4 +1,4 @@
-"""`cosim doctor`: what this installation consists of, what is wrong with it, and how to fix that."""
+"""`cosim doctor`: the components of this installation, its faults, and their remedies."""
 
 import argparse
 import json
@@ -20,9 +20,9 @@ OK, WARN, FAIL = "ok", "warn", "FAIL"
 DISTRIBUTION = "cosim-sumo"  # cosim's name on a package index
 INSTALL = "pip install -e . -c constraints.txt"
 REINSTALL = "pip install --force-reinstall libsumo"
-# What `import libsumo` misses on a bare Debian or Ubuntu (docs/reference/sumo.md).
+# Libraries that `import libsumo` needs on a minimal Debian or Ubuntu (docs/reference/sumo.md).
 APT_LINE = "apt-get install libx11-6 libxext6 libxrender1 libgl1 libatomic1"
-# One version for all of them: libsumo and sumolib are pinned together, eclipse-sumo rebuilds the nets.
+# All need the same version: libsumo and sumolib are pinned together, eclipse-sumo rebuilds the nets.
 SUMO_PACKAGES = ("libsumo", "sumolib", "traci", "eclipse-sumo", "sumo-data")
 PROBE_LIMIT = 120.0  # s for `sumo --version` and `import libsumo`: 300 MB of libraries from a cold, busy disk
 SIMULATION_LIMIT = 180.0  # s: numba compiles on the first run
@@ -40,7 +40,7 @@ _VERSION = "import libsumo; print(libsumo.getVersion()[1])"
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One line of the report; `fix` is what to do and is empty when all is well."""
+    """One line of the report; `fix` is the remedy, empty without a fault."""
 
     name: str
     state: str  # OK, WARN or FAIL
@@ -81,9 +81,9 @@ def work(args: argparse.Namespace) -> int:
 
 
 def examine(environment: Mapping[str, str]) -> Iterator[Check]:
-    """The checks, one after the other (the simulation last: it takes longest).
+    """The checks in order (the simulation last, because it takes longest).
 
-    `environment` is where PATH, SUMO_HOME and NUMBA_CACHE_DIR are looked up.
+    `environment`: source of PATH, SUMO_HOME and NUMBA_CACHE_DIR.
     """
     yield Check("python", OK, f"{sys.version.split()[0]} at {sys.executable}")
     yield from packages(version_of)
@@ -147,7 +147,7 @@ def sumo_packages(version: Callable[[str], str | None]) -> Iterator[Check]:
 
 
 def sumo_copies(environment: Mapping[str, str], pinned: str | None) -> Iterator[Check]:
-    """Every `sumo` program on PATH, and SUMO_HOME: cosim uses neither, but they explain many surprises."""
+    """Every `sumo` program on PATH, and SUMO_HOME: unused by cosim, but a frequent cause of confusion."""
     seen: set[Path] = set()
     for folder in environment.get("PATH", "").split(os.pathsep):
         program = shutil.which("sumo", path=folder) if folder else None
@@ -170,7 +170,7 @@ def sumo_copies(environment: Mapping[str, str], pinned: str | None) -> Iterator[
 
 
 def libsumo_library() -> Check:
-    """Whether `import libsumo` works, tried in a process of its own."""
+    """Whether `import libsumo` works, tested in a separate process."""
     if util.find_spec("libsumo") is None:
         return Check("libsumo library", FAIL, "is not installed", INSTALL)
     code, out, err = _run([sys.executable, "-c", _VERSION], PROBE_LIMIT)
@@ -178,7 +178,7 @@ def libsumo_library() -> Check:
 
 
 def explain_import(code: int, stderr: str) -> tuple[str, str]:
-    """What went wrong when libsumo was imported, and how to fix it."""
+    """The fault of a failed import of libsumo, and its remedy."""
     if missing := re.search(r"(lib[\w.+-]+\.so[\w.]*): cannot open shared object", stderr):
         return f"the system has no {missing[1]}", APT_LINE
     return _last_line(code, stderr.strip()), REINSTALL
@@ -192,7 +192,7 @@ def processors() -> Check:
 
 
 def numba_cache(environment: Mapping[str, str]) -> Check:
-    """Where numba keeps compiled code: without a writable place every process compiles anew."""
+    """Numba's cache folder: without a writable one every process compiles the kernels again."""
     chosen = environment.get("NUMBA_CACHE_DIR")
     home = Path(environment.get("XDG_CACHE_HOME") or Path(environment.get("HOME") or "/") / ".cache")
     source = Path(__file__).resolve().parents[1]
@@ -206,7 +206,7 @@ def numba_cache(environment: Mapping[str, str]) -> Check:
 
 
 def worlds() -> Check:
-    """Whether our own scenarios are there."""
+    """Whether the shipped scenarios are present."""
     import sumo_scenarios
 
     names = ", ".join(sumo_scenarios.names())
@@ -214,7 +214,7 @@ def worlds() -> Check:
 
 
 def confinement() -> Check:
-    """Whether a server on this machine takes uploads."""
+    """Whether a server on this machine accepts uploads."""
     from cosim.service.confined import lacking
 
     if problem := lacking():
@@ -240,7 +240,7 @@ def lanes(what: str) -> Check:
 
 
 def one_second() -> Check:
-    """One second of simulation in a process of its own: a world of ours through the whole loop."""
+    """One second of simulation of a shipped scenario in a separate process, through the whole loop."""
     with tempfile.TemporaryDirectory(prefix="cosim-doctor-") as folder:
         net = Path(folder) / "road.net.xml"
         net.write_text(_ROAD, encoding="utf-8")
@@ -277,7 +277,7 @@ def _last_line(code: int, stderr: str) -> str:
 
 
 def _writable(folder: Path) -> bool:
-    """Whether a file can be made in `folder`, or in the nearest parent that is there."""
+    """Whether a file can be created in `folder`, or in its nearest existing parent."""
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
     try:

@@ -1,4 +1,4 @@
-"""`cosim estimate`: crashes per million km at the rates at which humans err, with an interval."""
+"""`cosim estimate`: crashes per million km at the given rates of driver errors, with an interval."""
 
 import argparse
 import json
@@ -9,7 +9,7 @@ from cosim.cli import arguments, evaluate
 from cosim.errors import BadInput
 from cosim.scenario.options import EpisodeOptions
 
-FIELD = "field"  # the level of human errors that is estimated unless another one is named
+FIELD = "field"  # the default level of driver errors
 
 EPILOG = """\
 Most episodes are drawn with errors made more frequent (the tilt), and weigh less: docs/guides/estimate.md.
@@ -24,7 +24,7 @@ def add(commands: arguments.SubCommands) -> None:
         "estimate",
         help="estimate crashes per million km, by importance sampling",
         description="Estimate crashes and near-misses per million km of every combination of what the flags "
-        "or SPEC.yaml name, with 95 % intervals, at the rates at which human drivers err.",
+        "or SPEC.yaml name, with 95 % intervals, at the given rates of driver errors.",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -36,17 +36,17 @@ def add(commands: arguments.SubCommands) -> None:
     estimate.add_argument(
         "--tilt",
         metavar="TILT",
-        help="how much more frequent each kind of error is drawn, KIND=FACTOR,... (all=FACTOR), or none "
-        "(default: the world's)",
+        help="factor on the frequency of each kind of error, KIND=FACTOR,... (all=FACTOR), or none "
+        "(default: the scenario's)",
     )
     arguments.add(evaluate.add_work(estimate), "--json")
     estimate.set_defaults(work=work)
 
 
 def work(args: argparse.Namespace) -> int:
-    """0 when every episode has its row, whatever the rows say.
+    """0 when every episode has a row of any status.
 
-    Raises BadInput before anything is run, or CosimError when it cannot go on.
+    Raises BadInput before the first episode, or CosimError when the run cannot continue.
     """
     from cosim.batch import execution, matrix
     from cosim.policies import check
@@ -85,7 +85,7 @@ def work(args: argparse.Namespace) -> int:
 
 
 def _as_asked(case: EpisodeOptions, args: argparse.Namespace) -> EpisodeOptions:
-    """With the errors of `FIELD` unless others are named, and the tilt. Raises BadInput."""
+    """The case with errors of `FIELD` by default, and the tilt. Raises BadInput."""
     from cosim.scenario import tilt
 
     case = case if args.errors else replace(case, errors=case.errors or FIELD)

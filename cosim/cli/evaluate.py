@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from cosim.workers.engines import Engine
     from cosim.workers.tasks import Outcome
 
-LISTED = 200  # cells that a dry run lists
+MAX_LISTED = 200  # cells listed by a dry run
 
 
 def add(commands: arguments.SubCommands) -> None:
@@ -44,7 +44,7 @@ def add(commands: arguments.SubCommands) -> None:
 
 
 def add_matrix(command: argparse.ArgumentParser, errors: str = "none") -> None:
-    """The flags that say what is driven, but for the seeds. `errors`: the default of that flag."""
+    """The flags of the matrix, except seeds. `errors`: the default of that flag."""
     command.add_argument("spec", nargs="?", metavar="SPEC.yaml", help="the matrix, by the flags' names")
     axes = command.add_argument_group("the matrix (flags of SPEC.yaml's lists may be repeated)")
     arguments.options(
@@ -58,7 +58,7 @@ def add_matrix(command: argparse.ArgumentParser, errors: str = "none") -> None:
 
 
 def add_work(command: argparse.ArgumentParser) -> Any:
-    """The flags that say where and by whom it is driven; returns their group."""
+    """The flags of the execution; returns their group."""
     running = command.add_argument_group("the work")
     arguments.add(running, "--out", "--resume")
     arguments.add(running, "--workers", help="processes (default: all cores)")
@@ -71,9 +71,9 @@ def add_work(command: argparse.ArgumentParser) -> Any:
 
 
 def work(args: argparse.Namespace) -> int:
-    """0 when every episode has its row, whatever the rows say.
+    """0 when every episode has a row of any status.
 
-    Raises BadInput before anything is run, or CosimError when it cannot go on.
+    Raises BadInput before the first episode, or CosimError when the run cannot continue.
     """
     from cosim.batch import execution, matrix
     from cosim.policies import check
@@ -94,7 +94,7 @@ def work(args: argparse.Namespace) -> int:
 
 
 def continued(args: argparse.Namespace) -> bool:
-    """Whether a run is to go on with what its folder holds: neither a spec nor a flag of the matrix."""
+    """Whether to continue a run with its folder's plan: without a spec or a flag of the matrix."""
     from cosim.batch import spec
 
     return bool(args.resume) and args.spec is None and all(getattr(args, n) is None for n in spec.FIELDS)
@@ -113,7 +113,7 @@ def asked(args: argparse.Namespace) -> tuple[list[EpisodeOptions], range]:
 
 @contextlib.contextmanager
 def opened(plan: Plan, args: argparse.Namespace, begin: Callable[..., None]) -> Iterator[tuple[Store, Path]]:
-    """The store and the folder of a run, begun with this plan or resumed; nothing is left if that fails."""
+    """The store and the folder of a run, begun with this plan or resumed; removed again on failure."""
     from cosim.batch.folder import RunFolder
     from cosim.batch.store import Store
 
@@ -132,7 +132,7 @@ def opened(plan: Plan, args: argparse.Namespace, begin: Callable[..., None]) -> 
 
 
 def engine_of(args: argparse.Namespace) -> Engine:
-    """Who spreads the episodes over processes or machines."""
+    """The engine that distributes the episodes over processes or machines."""
     from cosim.batch.episode_runner import EpisodeRunner
     from cosim.workers.engines import LocalEngine
     from cosim.workers.supervisor import Limits
@@ -167,12 +167,12 @@ def _drive(plan: Plan, engine: Engine, store: Store, folder: Path, args: argpars
 
 @dataclass(frozen=True)
 class Driven:
-    """What came of a plan."""
+    """The result of a plan."""
 
     rows: Sequence[Mapping[str, Any]]
     summary: Mapping[str, Any]
-    faults: Sequence[Outcome]  # of our own code: they have no row
-    done: int  # episodes driven before
+    faults: Sequence[Outcome]  # internal errors, without a row
+    done: int  # episodes finished earlier
     seconds: float
 
     @property
@@ -187,7 +187,7 @@ class Driven:
             print(f"cosim: {fault.key}: no row, --resume tries it again: {fault.stderr}", file=sys.stderr)
 
     def text(self, plan: Plan, folder: Path) -> str:
-        """How many episodes, how fast, and what became of them."""
+        """Numbers of episodes, rate and statuses."""
         now = plan.episodes - self.done
         status = {**self.summary["status"], "not driven": plan.episodes - len(self.rows)}
         return (
@@ -198,7 +198,7 @@ class Driven:
 
 
 def driven(name: str, plan: Plan, engine: Engine, store: Store, folder: Path) -> Driven:
-    """Drive what the store does not hold yet, with progress, and export all."""
+    """Drive the missing episodes, with progress, and export all."""
     from cosim.batch import execution
     from cosim.report.run_folder import export
     from cosim.workers.progress import Progress
@@ -216,7 +216,7 @@ def driven(name: str, plan: Plan, engine: Engine, store: Store, folder: Path) ->
 
 
 def _warn(rows: Sequence[Mapping[str, Any]]) -> None:
-    """Say on stderr which episodes have no figures, and why."""
+    """Print episodes without figures and the reasons on stderr."""
     reasons: dict[tuple[str, str], list[str]] = {}
     for row in rows:
         if row["status"] != "ok":
@@ -249,15 +249,15 @@ def _dry_run(plan: Plan, engine: Engine, args: argparse.Namespace) -> int:
         }
         print(json.dumps(document))
         return 0
-    for cell in plan.cells[:LISTED]:
+    for cell in plan.cells[:MAX_LISTED]:
         s, case = cell.scenario, cell.case
         print(
             f"{cell.name}  {s.name} / {s.demand_name} / {case.policy}, {s.behavior}, "
             f"AVs by {s.fleet.describe()}, svo {case.svo_deg:g}, {s.preset}, {s.driver_model}, "
             f"{s.duration:g} s" + (f"  BAD INPUT: {cell.refused}" if cell.refused else "")
         )
-    if len(plan.cells) > LISTED:
-        print(f"... and {len(plan.cells) - LISTED} more")
+    if len(plan.cells) > MAX_LISTED:
+        print(f"... and {len(plan.cells) - MAX_LISTED} more")
     span = f"{plan.seeds.start}:{plan.seeds.stop}"
     print(f"{len(plan.cells)} cells x {len(plan.seeds)} seeds ({span}) = {plan.episodes} episodes")
     print(f"estimated time {'unknown' if seconds is None else _duration(seconds)} ({basis})")

@@ -11,7 +11,7 @@ def add(commands: arguments.SubCommands) -> None:
         "fit-predictors",
         help="fit the kinematic predictors on recorded episodes",
         description="Fit P's learned baselines and the Gaussian processes' prior over kernels on recordings "
-        "(cosim record) of training seeds; calibrate and measure on recordings of tuning seeds.",
+        "(cosim record) of training seeds; calibrate and measure on recordings of validation seeds.",
     )
     needed = {
         "--training": ("DIR", "recordings, seeds below 100000"),
@@ -28,7 +28,7 @@ def add(commands: arguments.SubCommands) -> None:
 
 
 def work(args: argparse.Namespace) -> int:
-    """Fit, print what was measured."""
+    """Fit, and print the measured errors."""
     from pathlib import Path
 
     from cosim.errors import BadInput

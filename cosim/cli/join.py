@@ -1,4 +1,4 @@
-"""`cosim join`: our agents drive vehicles of a SUMO that somebody else started (docs/guides/traci.md)."""
+"""`cosim join`: agents drive vehicles of a SUMO started by another program (docs/guides/traci.md)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def add(commands: arguments.SubCommands) -> None:
     """Register the command and its flags."""
     join = commands.add_parser(
         "join",
-        help="drive vehicles of a SUMO that somebody else started",
+        help="drive vehicles of a SUMO started by another program",
         description="Join a SUMO that waits for TraCI clients (sumo --remote-port PORT --num-clients N), "
         "drive some of its vehicles as AVs, and hand them back. Ctrl-C leaves it in order.",
     )
@@ -72,7 +72,7 @@ def work(args: argparse.Namespace) -> int:
     asked = of_flags({**vars(args), "scenario": "{}:{}".format(*args.place)})
     check(asked.policy)
     with new_folder(args.out) as folder:
-        driver = make(asked.policy)  # before SUMO has to wait for it
+        driver = make(asked.policy)  # before connecting, so that SUMO does not wait for it
         host_name, port = args.place
         client = Client(host_name, port, args.order, args.timeout)
         try:
@@ -105,7 +105,7 @@ def work(args: argparse.Namespace) -> int:
 
 
 def _warned(scenario: Scenario, place: str) -> Scenario:
-    """With what the SUMO at `place` does otherwise than cosim's."""
+    """The scenario with warnings about differences of the SUMO at `place` from cosim's."""
     from cosim.simulation.shared import lost
 
     return replace(
@@ -115,7 +115,7 @@ def _warned(scenario: Scenario, place: str) -> Scenario:
 
 @contextmanager
 def _leaving(simulator: Any) -> Iterator[None]:
-    """Ctrl-C and SIGTERM end the drive before the next step, so that SUMO is left in order; a second one
+    """Ctrl-C and SIGTERM end the drive before the next step, so that SUMO stays consistent; a second signal
     while SUMO does not answer ends it at once."""
 
     def leave(*_: object) -> None:

@@ -1,4 +1,4 @@
-"""The command line: one sub-command per module of `cosim.cli`, and what every exit code means."""
+"""The command line: one sub-command per module of `cosim.cli`, and the exit codes."""
 
 import argparse
 import contextlib
@@ -13,11 +13,11 @@ from cosim import __version__
 from cosim.cli import COMMANDS
 from cosim.errors import BadInput, CosimError, hint
 
-WITHOUT_FLAG = ("--scenario", "--world")  # what commands of one scenario take as their first word
+WITHOUT_FLAG = ("--scenario", "--world")  # flags that are a positional argument in commands of one scenario
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit codes: 0 finished, 1 a threshold failed, 2 bad input, 3 simulator failure, 4 our own failure,
+    """Exit codes: 0 finished, 1 a threshold failed, 2 bad input, 3 simulator failure, 4 internal failure,
     130 interrupted."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     options: list[str] = []
@@ -48,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parsed(arguments: list[str]) -> argparse.Namespace:
-    """Raises BadInput, with the nearest flag that there is, for words that no command takes."""
+    """The parsed arguments. Raises BadInput with the nearest flag for unknown arguments."""
     top = parser(*arguments[:1])
     args, unknown = top.parse_known_args(arguments)
     if not unknown:
@@ -72,7 +72,7 @@ def _command(top: argparse.ArgumentParser, name: str) -> argparse.ArgumentParser
 
 @contextlib.contextmanager
 def _terminable() -> Iterator[None]:
-    """SIGTERM (`docker stop`, a scheduler's limit) ends the work in order, as Ctrl-C does."""
+    """Handle SIGTERM (`docker stop`, a scheduler's limit) like Ctrl-C."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,4 +1,4 @@
-"""`cosim metrics`: our figures for floating-car data that SUMO wrote, with any drivers."""
+"""`cosim metrics`: cosim's figures for SUMO's floating-car data, with any drivers."""
 
 import argparse
 import json
@@ -58,7 +58,7 @@ def add(commands: arguments.SubCommands) -> None:
 
 
 def work(args: argparse.Namespace) -> int:
-    """Read it, count, print."""
+    """Read the data, compute the figures, print them."""
     from cosim.fcd import Roles, analyse
     from cosim.fcd.encounters import Encounter
     from cosim.fcd.vehicle_types import read_sizes
@@ -118,7 +118,7 @@ def work(args: argparse.Namespace) -> int:
 
 
 def _road(net: Path) -> Any:
-    """The net as a RoadMap; read in a process of its own, which a bad net may kill."""
+    """The net as a RoadMap, read in a separate process that a bad net may crash."""
     from cosim.scenario.vet_net import read_net
     from cosim.simulation.net import NetReader
     from cosim.workers.worker import Worker

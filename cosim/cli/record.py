@@ -1,4 +1,4 @@
-"""`cosim record`: drive episodes and keep what every vehicle did, for learning and measuring prediction."""
+"""`cosim record`: drive episodes and record every vehicle, for training and measuring predictors."""
 
 import argparse
 
@@ -11,7 +11,7 @@ def add(commands: arguments.SubCommands) -> None:
         "record",
         help="drive episodes and record every vehicle's states",
         description="Drive every combination of scenario, demand, behaviour, policy and seed on worker "
-        "processes; one Parquet file an episode, written whole.",
+        "processes; one Parquet file per episode.",
     )
     arguments.options(record, matrix=True, without=("output", "metric", "reward"))
     arguments.add(record, "--seeds", type=arguments.seeds, required=True)

@@ -1,4 +1,4 @@
-"""The command line as a page of the documentation: a Markdown extension that writes it from the parser."""
+"""The command line in the documentation: a Markdown extension that renders the parser."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from markdown.preprocessors import Preprocessor
 from cosim.cli import COMMANDS
 from cosim.cli.main import parser
 
-PLACE = "[command-line]"  # the line of a page that the commands replace
+PLACEHOLDER = "[command-line]"  # the line of a page replaced by the commands
 
 
 def commands() -> list[str]:
@@ -58,7 +58,7 @@ def _row(action: argparse.Action) -> str:
 
 
 def _values(action: argparse.Action) -> dict[str, Any]:
-    """What argparse puts in for `%(default)s` and the like."""
+    """Values of argparse's placeholders such as `%(default)s`."""
     return {**vars(action), "choices": ", ".join(map(str, action.choices or ()))}
 
 
@@ -67,20 +67,20 @@ def _cell(text: str) -> str:
 
 
 def _text(text: str) -> str:
-    """Help as Markdown: what would be read as markup is none."""
+    """Help as Markdown, with markup escaped."""
     return re.sub(r"([*_<\[])", r"\\\1", " ".join(text.split()))
 
 
 class _CommandLine(Preprocessor):
     def run(self, lines: list[str]) -> list[str]:
-        if PLACE not in lines:
+        if PLACEHOLDER not in lines:
             return lines
-        at = lines.index(PLACE)
+        at = lines.index(PLACEHOLDER)
         return [*lines[:at], *commands(), *lines[at + 1 :]]
 
 
 class CommandLine(Extension):
-    """Writes the commands where a page says `[command-line]`."""
+    """Renders the commands in place of `[command-line]`."""
 
     def extendMarkdown(self, md: Markdown) -> None:
         md.preprocessors.register(_CommandLine(md), "command-line", 100)  # before fences are read (25)

@@ -1,4 +1,4 @@
-"""`cosim replay`: drive a recorded episode again, check that it is the same, draw it as a page and a film."""
+"""`cosim replay`: drive a recorded episode again, check that it is equal, draw it as a page and a film."""
 
 import argparse
 import sys
@@ -37,7 +37,7 @@ def add(commands: arguments.SubCommands) -> None:
 
 
 def work(args: argparse.Namespace) -> int:
-    """Check, drive, compare, draw. Where a file is named, only those named are drawn."""
+    """Check, drive, compare, draw. With named output files only those are drawn."""
     from cosim.report.replay import episode as replay
 
     recorded = replay.find(Path(args.run), args.episode)

@@ -20,7 +20,7 @@ def add(commands: arguments.SubCommands) -> None:
 
 
 def work(args: argparse.Namespace) -> int:
-    """Write it and say where."""
+    """Write the report and print its path."""
     from cosim.report import html as report
     from cosim.report.run_folder import read
 

@@ -40,7 +40,7 @@ def add(commands: arguments.SubCommands) -> None:
         description="Drive one episode. Everything after -- goes to SUMO as it stands.",
     )
     run.add_argument(
-        "what", metavar="WHAT", help="a scenario's name (cosim scenarios), a world's folder or any .sumocfg"
+        "what", metavar="WHAT", help="a scenario's name (cosim scenarios), its folder or any .sumocfg"
     )
     arguments.options(run, without=("scenario",))
     arguments.add(run, "--out")
@@ -67,8 +67,8 @@ def add(commands: arguments.SubCommands) -> None:
 
 
 class Driver:
-    """What `cosim run` hosts in its worker: loads SUMO and the policy at once, while the caller still checks
-    the scenario. Raises BadInput for an unknown policy."""
+    """The hosted object of `cosim run`'s worker: loads SUMO and the policy while the caller checks the
+    scenario. Raises BadInput for an unknown policy."""
 
     def __init__(self, policy: str) -> None:
         import cosim.simulation.sumo  # noqa: F401
@@ -87,9 +87,9 @@ class Driver:
         served: tuple[int, int] | None,
         progress: Reported,
     ) -> tuple[EpisodeResult, Any]:
-        """The episode, with its replay data or None; progress of 0 s in all: kernels are being compiled.
+        """The episode, with its replay data or None; a progress total of 0 s: kernels are being compiled.
 
-        `served`: the port at which SUMO serves so many TraCI programs. Raises as `Host`.
+        `served`: port of SUMO, number of TraCI programs. Raises as `Host`.
         """
         from cosim.geometry.compiled import on_compilation
         from cosim.host import serving
@@ -113,7 +113,7 @@ class Driver:
 
 
 def work(args: argparse.Namespace) -> int:
-    """Drive it in a worker process, and beside it what `--beside` names; show the results."""
+    """Drive the episode and the policy of `--beside` in worker processes; show the results."""
     for flag, wanted in (("--output", args.output), ("--replay", args.replay)):
         if wanted and not args.out:
             raise BadInput("needs a run folder to write into: --out DIR", field=flag)
@@ -147,7 +147,7 @@ def work(args: argparse.Namespace) -> int:
             ]
         except BaseException:
             for worker in workers:
-                worker.kill()  # it is loading or driving, and has nothing to put away
+                worker.kill()  # nothing needs an orderly shutdown
                 worker.close()
             raise
     show(args, driven, folder, scenarios[0].mission.kind, cases[0].outputs)
@@ -162,7 +162,7 @@ def _drive(
     folder: Path | None,
     served: tuple[int, int] | None,
 ) -> tuple[EpisodeResult, Any]:
-    """One episode with its progress; its replay data or None."""
+    """One episode with progress; its replay data or None."""
     from cosim.scenario import sumo_outputs
     from cosim.scenario.manifest import TRACI, remembered
     from cosim.workers.progress import Progress
@@ -187,7 +187,7 @@ def _drive(
             raise
         finally:
             worker.close()
-            if files is not None:  # what a simulation that crashed leaves behind
+            if files is not None:  # leftovers of a crashed simulation
                 shutil.rmtree(files / sumo_outputs.DRAFT, ignore_errors=True)
     if served is None:
         more = remembered(case, args.sumo_options)
@@ -203,8 +203,8 @@ def show(
     mission: str,
     outputs: Sequence[str] = (),
 ) -> None:
-    """Print the episodes, of which the first is kept in the run folder, where there is one, with what the
-    replays draw. `mission`: of which kind it is."""
+    """Print the episodes; the first is stored in the run folder, if any, with the data of the replays.
+    `mission`: kind of the mission."""
     from cosim.report import result as output
     from cosim.report.episode_text import text
     from cosim.scenario.manifest import CASE
@@ -229,7 +229,7 @@ def show(
 
 
 def _beside(args: argparse.Namespace) -> EpisodeOptions:
-    """The same episode driven by `--beside`; SUMO writes no files of it. Raises BadInput."""
+    """The same episode with the policy of `--beside`, without SUMO's output files. Raises BadInput."""
     for flag, given in (("--json", args.json), ("--traci-port", args.traci_port is not None)):
         if given:
             raise BadInput(f"does not go together with {flag}", field="--beside", value=args.beside)
@@ -241,7 +241,7 @@ def _beside(args: argparse.Namespace) -> EpisodeOptions:
 
 
 def _served(args: argparse.Namespace) -> tuple[int, int] | None:
-    """The port at which SUMO serves so many TraCI programs; None: it drives alone."""
+    """SUMO's port and the number of TraCI programs; None without them."""
     if args.traci_port is not None:
         return args.traci_port, args.traci_clients or 1
     for flag, value in (("--traci-clients", args.traci_clients), ("--traci-timeout", args.traci_timeout)):
@@ -255,5 +255,5 @@ def _programs(count: int) -> str:
 
 
 def case_of(args: argparse.Namespace) -> EpisodeOptions:
-    """The episode that the flags describe; files by absolute path, so that it can be found again."""
+    """The episode of the flags; files by absolute path, so that a replay finds them."""
     return with_preset(replace(of_flags({**vars(args), "scenario": args.what}), seed=args.seed))

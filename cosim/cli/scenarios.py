@@ -1,4 +1,4 @@
-"""`cosim scenarios`: the scenarios and their demands, for people and for machines."""
+"""`cosim scenarios`: the scenarios and their demands, as text or JSON."""
 
 import argparse
 import json
@@ -19,7 +19,7 @@ def add(commands: arguments.SubCommands) -> None:
 
 
 def work(args: argparse.Namespace) -> int:
-    """List them."""
+    """List the scenarios."""
     from cosim.scenario import load
     from sumo_scenarios import names, open_roads
 

@@ -35,7 +35,7 @@ def add(commands: arguments.SubCommands) -> None:
 
 
 def work(args: argparse.Namespace) -> int:
-    """Serve until it is ended. Raises BadInput before it listens."""
+    """Serve until interrupted. Raises BadInput before listening."""
     with extra("service", field="serve"):
         from cosim.service.serving import serve
         from cosim.service.settings import database

@@ -1,4 +1,4 @@
-"""Environments on the one loop: `cosim.open`, Gymnasium ids `cosim/...-v0`, PettingZoo's `parallel_env`."""
+"""Environments on the loop: `cosim.open`, Gymnasium ids `cosim/...-v0`, PettingZoo's `parallel_env`."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""The Gymnasium environment on the one loop: one learning AV among humans and other AVs."""
+"""The Gymnasium environment: one learning AV among humans and other AVs."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class SumoEnv(gymnasium.Env[Observation, Any]):
         learner: the AV that learns. "mission": the AV that would have to yield to the mission vehicle, else
             as "nearest": the AV nearest upstream of the conflict zone. Or the id of an AV.
         others: builds the policy of the other AVs; None: SUMO's IDM.
-        observation: what the learner sees.
+        observation: of the learner.
         flatten: "kinematics" or "kinematics+law" for one vector; None for a dictionary.
         render_mode: "rgb_array" or None.
         continuous: actions are an acceleration in m/s2 and a lane offset, which is rounded.
@@ -78,7 +78,7 @@ class SumoEnv(gymnasium.Env[Observation, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode. Raises BadInput when no AV ever appears, or not the one that was named."""
+        """Begin an episode. Raises BadInput when no AV, or not the named AV, ever appears."""
         super().reset(seed=seed)
         if seed is None:
             seed = spaces.training_seed(self.np_random)
@@ -97,7 +97,7 @@ class SumoEnv(gymnasium.Env[Observation, Any]):
         """One decision of the learner."""
         name = self.learner
         step = self._session.act({name: spaces.action_of(action, self._continuous)}, see=(name,))
-        self._view = step.observations.get(name, self._view)  # gone: what it saw last
+        self._view = step.observations.get(name, self._view)  # after leaving the road: the last view
         reason = step.ended.get(name, "")
         terminated, truncated = step.terminated[name], step.truncated[name]
         info = self._info(step)
@@ -109,7 +109,7 @@ class SumoEnv(gymnasium.Env[Observation, Any]):
         return self._observation(), step.rewards[name], terminated, truncated, info
 
     def action_masks(self) -> npt.NDArray[np.int8]:
-        """[5] 0 for a lane change that cannot be: no lane there, or one is under way (sb3-contrib's name)."""
+        """[5] 0 for an impossible lane change: no lane, or a change under way (sb3-contrib's name)."""
         return self._view.action_mask.astype(np.int8)
 
     def render(self) -> Bytes | None:
@@ -124,7 +124,7 @@ class SumoEnv(gymnasium.Env[Observation, Any]):
     # ---- inside ----
 
     def _choose(self, views: Mapping[str, View], wanted: str) -> str:
-        """The AV that learns; "" while it is not on the road."""
+        """The learning AV's id; "" while it is off the road."""
         if wanted not in (MISSION, NEAREST):
             return wanted if wanted in views else ""
         partner = self._session.partner() if wanted == MISSION and views else ""
@@ -142,14 +142,14 @@ class SumoEnv(gymnasium.Env[Observation, Any]):
 
 
 def nearest_upstream(views: Mapping[str, View]) -> str:
-    """The AV with the shortest way to the conflict zone; those in it (0 m) or past it (inf) do not count
-    unless there are no others. "" without any AV."""
+    """The AV with the shortest distance to the conflict zone. AVs in it (0 m) or past it (inf) count only
+    without other AVs. "" without any AV."""
     upstream = {n: v.conflict_distance for n, v in views.items() if 0.0 < v.conflict_distance < np.inf}
     return min(upstream or views, key=lambda n: (upstream.get(n, 0.0), n), default="")
 
 
 def no_av(seed: int, name: str | None) -> BadInput:
-    """There is no learner: how to get one."""
+    """The error for a missing learner, with its remedy."""
     if name is not None:
         return BadInput(f"this AV was never on the road in episode {seed}", field="learner", value=name)
     return BadInput(

@@ -34,11 +34,11 @@ PolicyFactory = Callable[[], Policy]
 
 
 class Reply(NamedTuple):
-    """What one reset or act sends back."""
+    """The reply to one reset or act."""
 
     packed: Packed
     rewards: dict[str, RewardTerms]  # of every AV that was on the road before
-    ended: dict[str, str]  # AVs whose part ended in this step, and why
+    ended: dict[str, str]  # AV -> reason of its termination or truncation in this step
     receipts: tuple[Receipt, ...]
     events: Events  # of the whole decision (after a reset: of the warm-up)
     avs: tuple[str, ...]  # AVs on the road now
@@ -50,10 +50,10 @@ class Reply(NamedTuple):
 
 
 class SessionHost(Host):
-    """The caller commands the AVs it names in `act`; the policy commands those that are left (it sees only
-    these): `others`, or SUMO's IDM."""
+    """The caller commands the AVs named in `act`. The policy `others`, or SUMO's IDM, commands the remaining
+    AVs and observes only these."""
 
-    hooks: Sequence[Hook] = ()  # see every episode
+    hooks: Sequence[Hook] = ()  # for every episode
 
     def __init__(
         self,
@@ -92,7 +92,7 @@ class SessionHost(Host):
         decisions = {name: _decision(action) for name, action in actions.items()}
         left = {name: h for name, h in episode.histories.items() if name not in actions}
         decisions |= self.policy.decide(left)
-        # sorted: SUMO takes commands in the order given, which must not hang on a caller's dict order
+        # sorted, because SUMO's result depends on the order of commands, and a dict's order is arbitrary
         ordered = {name: decisions[name] for name in episode.histories if name in decisions}
         seen: Mapping[str, History] = episode.advance(ordered)
         assert episode.step is not None
@@ -109,13 +109,13 @@ class SessionHost(Host):
         return self.episode.result(policy, self.policy.label, self.svo)
 
     def snapshot(self) -> Snapshot:
-        """Every vehicle as it is now."""
+        """The present state of every vehicle."""
         self._check_started()
         return self.episode.snapshot
 
     def partner(self) -> str:
-        """The AV that reaches the conflict zone next after the mission vehicle does, at present speeds: the
-        one that would have to yield. "" without a mission vehicle or zone ahead, or without such an AV."""
+        """The AV that would have to yield: at present speeds the next AV to reach the conflict zone after
+        the mission vehicle. "" without a mission vehicle or zone ahead, or without such an AV."""
         self._check_started()
         s, road = self.episode.snapshot, self.simulator.road
 
@@ -202,7 +202,7 @@ def _decision(action: int | ContinuousAction) -> Decision:
 
 
 def _common(observation: ObservationConfig, others: Policy) -> ObservationConfig:
-    """One observer serves both: the caller's observation, with maps when either side wants them."""
+    """The common observation of both sides: the caller's, with maps if either side needs them."""
     theirs = others.observation
     if theirs == observation or theirs == replace(observation, maps=True):
         return theirs

@@ -1,4 +1,4 @@
-"""The PettingZoo environment on the one loop: every AV is an agent, all act at once."""
+"""The PettingZoo environment: every AV is an agent, and all act at once."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from cosim.observation.view import View
 from cosim.scenario import Scenario
 from cosim.types import COMPACT, Bytes, MetaAction, ObservationConfig
 
-MAX_AGENTS = 32  # slots: about twice the AVs on the road in our worlds; SUMO drives any further ones
-NATIVE_RANDOM = 0  # the seed of the seeds, until reset(seed=...) gives another
+MAX_AGENTS = 32  # slots: about twice the AVs of the shipped scenarios; SUMO drives further AVs
+NATIVE_RANDOM = 0  # seed of the episode seeds, until reset(seed=...) replaces it
 
 Step = tuple[
     dict[str, Observation], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]
@@ -27,7 +27,7 @@ Step = tuple[
 
 
 def parallel_env(config: str | Scenario = "merge", **words: Any) -> SumoParallelEnv:
-    """Make a `SumoParallelEnv` under PettingZoo's usual name; `words` are its own and `cosim.open`'s."""
+    """Make a `SumoParallelEnv` under PettingZoo's usual name; `words`: its options and `cosim.open`'s."""
     return SumoParallelEnv(config, **words)
 
 
@@ -78,7 +78,7 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
         self._continuous, self._padded = continuous, padded
         self._config, self._flatten = observation, flatten
         self._rng = np.random.default_rng(NATIVE_RANDOM)
-        self.vehicles: dict[str, str] = {}  # agent -> SUMO id, of all that have had one in this episode
+        self.vehicles: dict[str, str] = {}  # agent -> SUMO id, of all agents of this episode
         self._session: Session = sessions.open(config, observation=observation, **words)
 
     @property
@@ -87,7 +87,7 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
         return self._session
 
     def observation_space(self, agent: str) -> spaces.Space:
-        """Of one agent; all are alike."""
+        """Of one agent; equal for all agents."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> Any:
@@ -126,7 +126,7 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
         self._join(step.observations)
         self._drive_on()
         over = self._session.over
-        everyone = list(dict.fromkeys((*before, *self.agents)))  # those who departed in this step behind
+        everyone = list(dict.fromkeys((*before, *self.agents)))  # newly departed AVs last
         waiting = [a for a in everyone if a not in driving]
         rewards = dict.fromkeys(waiting, 0.0) | {a: step.rewards[av] for a, av in driving.items()}
         terminated = dict.fromkeys(waiting, False) | {a: step.terminated[av] for a, av in driving.items()}
@@ -157,7 +157,7 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
     # ---- inside ----
 
     def _join(self, views: dict[str, View]) -> None:
-        """Give every AV that is new on the road the next slot; remember what each agent sees."""
+        """Assign the next slot to every new AV; store each agent's view."""
         departed = {name: k for k, name in enumerate(self._session.events.departed)}
         new = views.keys() - self.vehicles.values()
         free = self.possible_agents[len(self.vehicles) :]
@@ -169,7 +169,7 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
 
     @property
     def _driving(self) -> dict[str, str]:
-        """The agents whose AVs are on the road, and those."""
+        """Agent -> AV, for AVs on the road."""
         return {agent: self.vehicles[agent] for agent in self.agents if agent in self.vehicles}
 
     def _drive_on(self) -> None:

@@ -20,7 +20,7 @@ class Painter:
         self._block = np.zeros((1, len(CHANNELS), VIEW.height, VIEW.width), np.uint8)
 
     def paint(self, s: Snapshot, vehicle: str | None) -> Bytes:
-        """[160, 640, 3] RGB, centred on `vehicle` (gone or None: on the first one; a blank without any)."""
+        """[160, 640, 3] RGB, centred on `vehicle` (missing or None: the first vehicle; blank without any)."""
         picture = np.empty((VIEW.height, VIEW.width, 3), np.uint8)
         picture[:] = GRASS
         if not s.n:

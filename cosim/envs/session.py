@@ -1,4 +1,4 @@
-"""A session: a scenario driven step by step by your own agent, the simulation in a process of its own."""
+"""A session: a scenario driven step by step by the caller's agent, with the simulation in its own process."""
 
 from __future__ import annotations
 
@@ -39,24 +39,23 @@ if TYPE_CHECKING:
     from cosim.road import RoadMap
 
 Action = int | ContinuousAction | tuple[float, int]
-TIMEOUT = 120.0  # s without an answer; the first step of a machine compiles the kernels
-TERMINAL = ("collision", "collision of the mission vehicle")  # all else that ends it cuts it short
+TIMEOUT = 120.0  # s without an answer; the first step on a machine compiles the kernels
+TERMINAL = ("collision", "collision of the mission vehicle")  # all other reasons truncate
 
 
 class StepResult(NamedTuple):
-    """What one `Session.act` (one decision, 0.4 s) brought, by AV.
+    """The result of one `Session.act` (one decision, 0.4 s), by AV.
 
     Attributes:
-        observations: what each AV on the road sees now.
-        rewards: what each AV earned that was on the road before the step; so for the next four.
+        observations: of each AV on the road.
+        rewards: of each AV that was on the road before the step; the next four fields likewise.
         terms: the rewards' terms.
         terminated: whether the AV or the mission vehicle crashed.
         truncated: whether the duration is over, the AV left the road (arrived, teleported), or another AV's
             collision ended the episode.
-        ended: why an AV is terminated or truncated.
-        receipts: whether each command was carried out, and why not; with a `decision_latency` (sensing) of
-            the commands before.
-        events: what happened in the step.
+        ended: reason of each termination or truncation.
+        receipts: outcome of each command; with a `decision_latency` (sensing), of the previous commands.
+        events: of the step.
         info: time and elapsed in s, steps, over.
     """
 
@@ -72,7 +71,7 @@ class StepResult(NamedTuple):
 
 
 class Caller(Protocol):
-    """What a session needs of a worker."""
+    """The part of a worker that a session uses."""
 
     def call(self, method: str, *arguments: Any) -> Any: ...
 
@@ -98,21 +97,21 @@ def open(
 
     Args:
         what: a scenario's name or folder, a path to any .sumocfg, or a `Scenario`.
-        fleet: which vehicles are AVs, in place of `penetration`, `av_type` and `av_ids`.
+        fleet: the choice of AVs, in place of `penetration`, `av_type` and `av_ids`.
         options: SUMO's options, as typed after `--`.
         seed: of the first episode.
-        observation: what an AV sees.
+        observation: of an AV.
         reward: a `cosim.rewards.Reward` (a `RewardConfig`, a function), a name of `REWARDS`, FILE.py:NAME or
             MODULE:NAME; None: P's.
-        metrics: classes like those of `cosim.metrics`, or FILE.py:NAME, measured besides.
+        metrics: additional metrics: classes like those of `cosim.metrics`, or FILE.py:NAME.
         others: builds the policy of the AVs without an action; None: SUMO's IDM.
         simulator: replaces SUMO, for tests (`cosim.simulation.fake`).
         timeout: s without a heartbeat after which the process counts as hung.
-        worker: False runs the simulation in this process, for debugging: one at a time, and a crash of SUMO
-            ends the process.
+        worker: False runs the simulation in this process, for debugging: one simulation at a time, and a
+            crash of SUMO ends the process.
         **words: options of `cosim run` by their names: `demand`, `behavior`, `preset`, `duration` in s, `svo`
-            in degrees (it weighs the reward), ... (`cosim.scenario.options`). A `Scenario` holds all but
-            `svo`: beside it they are refused.
+            in degrees (it weighs the reward), ... (`cosim.scenario.options`). A `Scenario` contains all
+            except `svo`; beside a `Scenario` the others are refused.
 
     Objects are used in the simulation's process: they must be importable.
 
@@ -141,8 +140,8 @@ def open(
         simulator,
         tuple(metrics),
     )
-    # a daemonic process (gymnasium's AsyncVectorEnv, SB3's SubprocVecEnv) may have no children, but is a
-    # process of its own already
+    # a daemonic process (gymnasium's AsyncVectorEnv, SB3's SubprocVecEnv) may not have children, and already
+    # isolates the simulation
     in_process = not worker or multiprocessing.current_process().daemon
 
     def connect() -> Caller:
@@ -168,8 +167,8 @@ setattr(open, "__signature__", _own.replace(parameters=[*[*_own.parameters.value
 class Session(contextlib.AbstractContextManager["Session"]):
     """One scenario in a supervised process, made by `cosim.open`. Several sessions can be open at once.
 
-    SUMO's IDM drives an AV without an action, also when the AV was commanded before. When the process ends,
-    the next call raises SimulationCrashed, and `reset` starts a fresh process. Use a session in a `with`
+    SUMO's IDM drives an AV without an action, even if the AV was commanded before. When the process ends, the
+    next call raises SimulationCrashed, and `reset` starts a fresh process. Use a session in a `with`
     statement, or close it.
     """
 
@@ -190,7 +189,7 @@ class Session(contextlib.AbstractContextManager["Session"]):
             seed: of the episode; None: the seed after the last.
 
         Returns:
-            What each AV sees, by its id.
+            The view of each AV, by its id.
         """
         seed = self._next_seed if seed is None else seed
         if not 0 <= seed < 2**63:
@@ -204,7 +203,7 @@ class Session(contextlib.AbstractContextManager["Session"]):
         return self.observe()
 
     def observe(self) -> dict[str, View]:
-        """What each AV sees now, as far as `act` asked for it; begins an episode if none has begun."""
+        """The view of each AV that `act` requested; begins an episode if none has begun."""
         if self._views is None:
             self.reset()
         assert self._views is not None
@@ -219,12 +218,12 @@ class Session(contextlib.AbstractContextManager["Session"]):
         """Carry out one action per AV for one decision (0.4 s).
 
         Args:
-            actions: AV id -> a meta-action or its number, or a `ContinuousAction` or such a pair; None, or an
-                AV left out: `others` drives it, else SUMO.
-            see: the AVs whose observation is wanted; None: all. Fewer are faster.
+            actions: AV id -> a meta-action or its number, or a `ContinuousAction` or such a pair. `others`,
+                or else SUMO, drives an AV with None or without an action.
+            see: the AVs to observe; None: all. Fewer are faster.
 
         Raises:
-            BadInput: an id that is not an AV on the road, something that is no action, no episode.
+            BadInput: an id that is not an AV on the road, an invalid action, no episode.
             SimulationError, SimulationCrashed: SUMO failed; its process ended or hung.
         """
         if self._views is None:
@@ -247,15 +246,15 @@ class Session(contextlib.AbstractContextManager["Session"]):
         )
 
     def result(self, policy: str = "external") -> EpisodeResult:
-        """The figures of the episode so far; `policy` is what the result calls the caller."""
+        """The figures of the episode so far; `policy` is the caller's name in the result."""
         return cast(EpisodeResult, self._call("result", policy))
 
     def snapshot(self) -> Snapshot:
-        """Every vehicle on the road (the simulator's truth: what an agent must not see)."""
+        """Every vehicle on the road (the true state, which an agent must not see)."""
         return cast(Snapshot, self._call("snapshot"))
 
     def partner(self) -> str:
-        """The AV that would have to yield to the mission vehicle; "" when there is none.
+        """The AV that would have to yield to the mission vehicle; "" without one.
 
         At present speeds, it is the next AV to reach the conflict zone after the mission vehicle.
         """
@@ -271,7 +270,7 @@ class Session(contextlib.AbstractContextManager["Session"]):
 
     @property
     def pid(self) -> int | None:
-        """The simulation's process; None when it runs in this one or has ended."""
+        """The simulation's process id; None if it runs in this process or has ended."""
         return getattr(self._caller, "pid", None)
 
     def close(self) -> None:
@@ -298,7 +297,7 @@ class Session(contextlib.AbstractContextManager["Session"]):
             return self._caller.call(method, *arguments)
         except BadInput:
             raise
-        except BaseException:  # SUMO failed, or Ctrl-C left an answer in the pipe: reset starts afresh
+        except BaseException:  # SUMO failed, or Ctrl-C left an answer in the pipe: reset starts a new process
             self._caller.close()
             self._caller = None
             self._views = None
@@ -343,7 +342,7 @@ def _continuous(name: str, action: Any) -> ContinuousAction:
 
 
 class _InProcess:
-    """A `Caller` without a process of its own."""
+    """A `Caller` in the present process."""
 
     def __init__(self, host: SessionHost) -> None:
         self._host = host
@@ -364,7 +363,7 @@ def build_host(
     simulator: SimulatorFactory | None,
     more: Sequence[str | MetricFactory],
 ) -> SessionHost:
-    """Runs in the worker: the loop, numba, libsumo and a user's code are imported there, not here."""
+    """Runs in the worker: only there are the loop, numba, libsumo and a user's code imported."""
     from cosim.envs.host import SessionHost
 
     return SessionHost(scenario, observation, svo, read(reward, "reward"), others, simulator, more)

@@ -17,7 +17,7 @@ from cosim.fcd.file import Row, Step, lanes_named, read_steps
 from cosim.fcd.vehicle_types import DEFAULT, Size, size_of
 from cosim.files.xml_input import Progress
 from cosim.metrics import METRICS, MetricContext
-from cosim.metrics.post_encroachment import LONGEST
+from cosim.metrics.post_encroachment import MAX_PET
 from cosim.road import Lane, RoadMap
 from cosim.simulation.conventions import OURS, centres, type_names
 from cosim.types import Kind, Metric, Snapshot, Timing
@@ -182,7 +182,7 @@ class _Counter:
         skipped = range(self._index + 1, self._index + round(passed))
         self._index += round(passed)
         # the file may omit steps without vehicles: add empty ones, as far back as any metric remembers
-        for k in list(skipped)[-math.ceil(LONGEST / self._interval) - 1 :]:
+        for k in list(skipped)[-math.ceil(MAX_PET / self._interval) - 1 :]:
             if k % self._stride == 0:
                 empty = Step(step.time - (self._index - k) * self._interval)
                 self._count(self._snapshot(empty))

@@ -15,8 +15,8 @@ from cosim.geometry import (
     time_to_collision,
 )
 from cosim.metrics.context import CRITICAL, watched
-from cosim.metrics.near_misses import APART
-from cosim.metrics.post_encroachment import LONGEST
+from cosim.metrics.near_misses import MIN_PAUSE
+from cosim.metrics.post_encroachment import MAX_PET
 from cosim.road import RoadMap
 from cosim.types import Snapshot
 
@@ -67,7 +67,7 @@ class _Followed:
             Boxes(x, y, heading, length, width, speed)
             for (x, y, heading, speed), (length, width) in zip(ways, self.sizes, strict=True)
         )
-        pet = post_encroachment_time(ego, foe, interval, LONGEST)
+        pet = post_encroachment_time(ego, foe, interval, MAX_PET)
         self.encounter.pet_s = pet if math.isfinite(pet) else math.nan
         return self.encounter
 
@@ -95,11 +95,11 @@ class Encounters:
             ttc = time_to_collision(columns, boxes(s), self._critical)  # [k,n] s
             for k, j in np.argwhere(ttc < self._critical).tolist():
                 self._meet(s, int(rows[k]), j, float(ttc[k, j]))
-        over = [pair for pair, f in self._open.items() if s.time - f.encounter.end_s > APART + 1e-9]
+        over = [pair for pair, f in self._open.items() if s.time - f.encounter.end_s > MIN_PAUSE + 1e-9]
         self._late += [self._open.pop(pair) for pair in over]
         for followed in (*self._open.values(), *self._late):
             followed.add(snapshot)
-        gone = [f for f in self._late if s.time - f.encounter.end_s > LONGEST + 1e-9]
+        gone = [f for f in self._late if s.time - f.encounter.end_s > MAX_PET + 1e-9]
         self._late = [f for f in self._late if f not in gone]
         self._closed += [f.finish(self._interval) for f in gone]
 

@@ -1,1 +1,1 @@
-"""What joins agent and simulation: training from rollouts and recordings, measurements of predictions."""
+"""Agent and simulation together: training from rollouts and recordings, measurements of predictions."""

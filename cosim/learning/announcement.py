@@ -1,4 +1,4 @@
-"""What a training says before it learns: what it does, when learning begins, where the curves are."""
+"""Messages of a training before it learns: its schedule, the start of learning, the place of the curves."""
 
 import math
 import sys
@@ -7,10 +7,10 @@ import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 
-from policy.training.curriculum import Drive, Drove, VfnTraining
+from policy.training.curriculum import Drive, DriveResult, VfnTraining
 from policy.training.vfn import Actors
 
-LINE_EVERY = 10.0  # s between two lines about the decisions that are still wanted
+LINE_EVERY = 10.0  # s between two lines about the prefill
 
 
 def announce(title: str, lines: Mapping[str, str]) -> None:
@@ -21,13 +21,13 @@ def announce(title: str, lines: Mapping[str, str]) -> None:
 
 
 def curves(folder: str, log: str) -> str:
-    """How to look at the curves of the training that writes into `folder`, and its file `log`."""
+    """The command that shows the curves of a training in `folder`, and its file `log`."""
     return f"tensorboard --logdir {folder}  (as lines: {folder}/{log})"
 
 
 def begin(name: str, training: VfnTraining, wanted: int, folder: str) -> None:
-    """Say what a training of a value network does. `wanted`: decisions before the first update; `folder`:
-    where it writes, as commands shall name it."""
+    """Announce a training of a value network. `wanted`: decisions before the first update; `folder`: its
+    output folder, as written in commands."""
     demands: dict[str, list[str]] = {}
     for lesson in training.lessons:
         demands.setdefault(lesson.scenario, []).append(lesson.demand)
@@ -48,30 +48,30 @@ def begin(name: str, training: VfnTraining, wanted: int, folder: str) -> None:
 
 
 class Announced:
-    """Actors that say until the first update how long it takes.
+    """Actors that report the time left until the first update.
 
     Args:
-        actors: where episodes are driven.
-        wanted: decisions of AVs that are recorded before the first update.
+        actors: executor of the episodes.
+        wanted: recorded decisions of AVs before the first update.
         say: shows a line.
     """
 
     def __init__(self, actors: Actors, wanted: int, say: Callable[[str], None]) -> None:
         self.recorded = 0  # decisions in the replay buffer
         self._actors, self._wanted, self._say = actors, wanted, say
-        self._first: tuple[float, int] | None = None  # when the first drive ended, and what it recorded
+        self._first: tuple[float, int] | None = None  # end of the first episode, and its recorded decisions
         self._began = time.monotonic()
         self._said = -math.inf
-        self._lock = threading.Lock()  # drives end in threads of their own
+        self._lock = threading.Lock()  # episodes end in separate threads
 
-    def submit(self, drive: Drive) -> Future[Drove]:
-        """Drive it soon."""
+    def submit(self, drive: Drive) -> Future[DriveResult]:
+        """Queue the episode."""
         future = self._actors.submit(drive)
         if drive.record and self.recorded < self._wanted:
             future.add_done_callback(self._ended)
         return future
 
-    def _ended(self, future: "Future[Drove]") -> None:
+    def _ended(self, future: "Future[DriveResult]") -> None:
         if future.cancelled() or future.exception() is not None:
             return
         with self._lock:
@@ -87,7 +87,7 @@ class Announced:
             self._first = self._first or (now, self.recorded)
 
     def _time_left(self, now: float) -> str:
-        """In words. The first drive starts processes and compiles: later ones do not count its time."""
+        """In words. The first episode is excluded, because it starts processes and compiles kernels."""
         since, before = self._first or (self._began, 0)
         speed = (self.recorded - before) / max(now - since, 1e-9)
         if not speed:

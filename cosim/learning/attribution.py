@@ -1,4 +1,4 @@
-"""`cosim bench attribution`: which inputs of a value network change a choice, and which change the drive."""
+"""`cosim bench attribution`: the effect of a value network's inputs on choices and on whole episodes."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple
@@ -26,11 +26,11 @@ from policy.agents.prediction_aware import PredictionAware
 from policy.attribution import ORACLE, SUMS, Questioned, Replaced, replacements
 
 PAGE, TABLE, PICTURE = "attribution.md", "attribution.csv", "attribution.png"
-DRIVEN = "closed_loop.csv"
-SHARED = ("crashed", "mission_success")  # figures of an episode that are yes or no, and those that are not:
+CLOSED_LOOP = "closed_loop.csv"
+SHARED = ("crashed", "mission_success")  # boolean figures of an episode, and numeric figures:
 FIGURES = ("mission_time_s", "av_near_misses_ttc", "hard_brakings_av", "dt_mean_m", "dt_av_m", "dt_mission_m")
-BY = "dt_mission_m"  # the one that is tested
-NOTHING = "nothing", ""  # is replaced
+TESTED_FIGURE = "dt_mission_m"  # figure of the significance test
+NOTHING = "nothing", ""  # no replacement
 SHARES = ("choices_changed", "unmasked_changed")
 HEAD = (
     "| input | replacement | decisions | choices changed | best valued changed | mean abs dq | spread |",
@@ -46,7 +46,7 @@ value is above the second best."""
 
 
 def questioned(policy: str) -> Questioned:
-    """The policy, asking itself. Raises BadInput where it has no value network."""
+    """The policy with attribution. Raises BadInput without a value network."""
     made = make(policy)
     if not isinstance(made, PredictionAware):
         raise BadInput("has no value network whose inputs could be replaced", field="--policy", value=policy)
@@ -54,10 +54,10 @@ def questioned(policy: str) -> Questioned:
 
 
 class Asking(EpisodeRunner):
-    """Hosted by an engine's worker: drives as `cosim run` does, and asks at every decision."""
+    """Hosted by an engine's worker: drives as `cosim run`, with attribution at every decision."""
 
     def policy(self, case: EpisodeOptions) -> Questioned:
-        """The policy of `case`, asking itself."""
+        """The policy of `case` with attribution."""
         self._agent = questioned(case.policy)
         return self._agent
 
@@ -69,7 +69,7 @@ class Asking(EpisodeRunner):
 
 
 class Replacing(EpisodeRunner):
-    """Hosted by an engine's worker: drives by what the network answers with one input replaced."""
+    """Hosted by an engine's worker: drives with one input of the network replaced."""
 
     _what: tuple[str, str] = NOTHING
 
@@ -78,7 +78,7 @@ class Replacing(EpisodeRunner):
     ) -> dict[str, Any]:
         """One episode with `what` replaced; the document of `cosim run --json`."""
         if what != self._what:
-            self.close()  # the host of the same cell, whose agent has another input replaced
+            self.close()  # host of the same cell with another replaced input
             self._what = what
         return super().run(case, warnings, None, progress)
 
@@ -101,19 +101,19 @@ def attribution(
     *,
     errors: str | None = None,
     closed_loop: bool = False,
-    by: str = BY,
+    by: str = TESTED_FIGURE,
     replaced: Sequence[str] = (),
     workers: int = 1,
     command: str = "",
 ) -> None:
-    """Drive and ask; writes TABLE, PICTURE and PAGE into `out`.
+    """Measure the attribution; writes TABLE, PICTURE and PAGE into `out`.
 
-    `closed_loop`: also drives every episode with each of `policy.attribution.replacements`: DRIVEN, and a
-    part of PAGE, where the worlds are tested by the figure `by`. `replaced`: these inputs alone, not all.
+    `closed_loop`: also drives every episode with each of `policy.attribution.replacements`. Results are in
+    CLOSED_LOOP and a part of PAGE, with scenarios tested by the figure `by`. `replaced`: only these inputs.
     `errors`: of the human drivers.
 
-    Raises BadInput as `cosim.batch.record.planned`, for a policy without a value network, for a figure that
-    is none of FIGURES, and for an input that a policy does not have.
+    Raises BadInput as `cosim.batch.record.planned`, for a policy without a value network, for a figure
+    outside of FIGURES, and for an input that a policy does not have.
     """
     if by not in FIGURES:
         raise BadInput(f"is none of {', '.join(FIGURES)}", field="--by", value=by)
@@ -134,19 +134,19 @@ def attribution(
         rows: list[dict[str, Any]] = []
         for part in closed(plan, workers, replaced):
             rows += part
-            write_csv(out / DRIVEN, rows)
+            write_csv(out / CLOSED_LOOP, rows)
         page += "\n" + closed_markdown(rows, by)
     (out / PAGE).write_text(page, encoding="utf-8")
 
 
 def _ways(agent: PredictionAware) -> list[tuple[str, str]]:
-    """The (input, replacement) with which an agent can drive."""
+    """The pairs (input, replacement) available for an agent."""
     return [*replacements(agent.vfn, agent.observation.frames), ORACLE]
 
 
 def closed(plan: Plan, workers: int = 1, replaced: Sequence[str] = ()) -> Iterator[list[dict[str, Any]]]:
-    """Per policy and world: a row per replacement (none first; of `replaced` inputs alone, where some are
-    named) and episode, SHARED and FIGURES."""
+    """Per policy and scenario: a row per replacement (none first; only of `replaced` inputs, if given) and
+    episode, with SHARED and FIGURES."""
     keys = ("policy", "scenario", "seed", *SHARED, *FIGURES)
     for cell in plan.cells:
         cases = [case for one, case in plan.cases() if one is cell]
@@ -163,8 +163,8 @@ def closed(plan: Plan, workers: int = 1, replaced: Sequence[str] = ()) -> Iterat
         ]
 
 
-def closed_markdown(rows: Sequence[Mapping[str, Any]], by: str = BY) -> str:
-    """The drives with replaced inputs against those without, paired, as a document."""
+def closed_markdown(rows: Sequence[Mapping[str, Any]], by: str = TESTED_FIGURE) -> str:
+    """Episodes with replaced inputs against episodes without, paired, as a document."""
     page = ["## Driven with an input replaced", ""]
     page += [
         "Whole episodes on equal seeds; differences to the drive with all inputs as they are, with 95 %",
@@ -214,7 +214,7 @@ Arm = tuple[str, str]  # input, replacement
 def _tested(
     drives: Mapping[str, Mapping[Arm, Sequence[Mapping[str, Any]]]], by: str
 ) -> dict[str, dict[Arm, float]]:
-    """World -> arm -> p of `by` against the drives with nothing replaced, over the worlds by Holm."""
+    """Scenario -> arm -> p of `by` against episodes without replacement, corrected over scenarios by Holm."""
     out: dict[str, dict[Arm, float]] = {world: {} for world in drives}
     for key in dict.fromkeys(key for arms in drives.values() for key in arms if key != NOTHING):
         worlds = [world for world, arms in drives.items() if key in arms]
@@ -225,7 +225,7 @@ def _tested(
 
 
 def _numbers(rows: Sequence[Mapping[str, Any]], figure: str) -> list[float]:
-    """One figure of all episodes; nan where it is NA."""
+    """One figure of all episodes; nan for NA."""
     return [float("nan") if row[figure] is None else float(row[figure]) for row in rows]
 
 
@@ -233,11 +233,11 @@ def table(driven: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """A row per input and replacement: shares of the decisions with Wilson's intervals, and means.
 
     Args:
-        driven: what `Asking.run` returned for the episodes of one policy.
+        driven: results of `Asking.run` for the episodes of one policy.
     """
     rows = []
     keys = list(dict.fromkeys(key for episode in driven for key in episode["answers"]))
-    inputs = list(dict.fromkeys(name for name, _ in keys))  # an input's replacements stand together
+    inputs = list(dict.fromkeys(name for name, _ in keys))  # grouped by input
     for key in sorted(keys, key=lambda key: inputs.index(key[0])):
         found = np.sum([e["answers"][key] for e in driven if key in e["answers"]], 0)
         sums = dict(zip(SUMS, found.tolist(), strict=True))
@@ -254,7 +254,7 @@ def table(driven: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 def markdown(
     driven: Sequence[Mapping[str, Any]], tables: Mapping[str, Sequence[Mapping[str, Any]]], command: str
 ) -> str:
-    """The tables as a document; what changes nothing is said first."""
+    """The tables as a document; inputs without effect come first."""
     page = ["# Which inputs the value networks use", ""]
     for policy, rows in tables.items():
         largest = {
@@ -290,7 +290,7 @@ def markdown(
 
 
 def draw(path: Path, tables: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
-    """Bars: the share of the choices that change, by input and replacement, a panel per policy."""
+    """Bars: share of changed choices by input and replacement, a panel per policy."""
     longest = max(map(len, tables.values()))
     figure = Figure(figsize=(1.0 + 3.6 * len(tables), 1.0 + 0.22 * longest), layout="constrained")
     panels = figure.subplots(1, len(tables), squeeze=False, sharex=True)[0]

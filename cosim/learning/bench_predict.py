@@ -1,4 +1,4 @@
-"""`cosim bench predict`: how far off the kinematic predictors are, and what their intervals are worth."""
+"""`cosim bench predict`: position error and interval coverage of the kinematic predictors."""
 
 import json
 import math
@@ -23,13 +23,13 @@ from policy.prediction.forecast import KinematicForecast
 from policy.prediction.lane import along_lanes
 from policy.prediction.predictors import PREDICTORS, Predictor, make_predictor
 
-EVERY = 5  # frames between two moments: 1 s
-LED = "gp-lane"  # knows the road, so it is not in the table of predictors
+FRAME_STRIDE = 5  # frames between two moments: 1 s
+LED = "gp-lane"  # uses the road, so it is not in the table of predictors
 HORIZON, DT = 20, 0.2  # frames, s
 PAGE, MAPS_PAGE = "prediction.md", "prediction_maps.md"
-PICTURED = "roundabout"  # the scenario whose maps are drawn, where it was recorded
-TOLERATED = 0.03  # a 90 % interval shall cover 90 +- 3 %
-PORTION = 2048  # windows forecast at once
+PICTURE_SCENARIO = "roundabout"  # scenario of the drawn maps, if recorded
+TOLERANCE = 0.03  # a 90 % interval should cover 90 +- 3 %
+CHUNK = 2048  # windows forecast at once
 
 
 def bench_predict(
@@ -96,7 +96,7 @@ def bench_maps(
     logs = {name: path.with_suffix(".csv") for name, path in weights.items()}
     if present := {name: log for name, log in logs.items() if log.is_file()}:
         map_figures.training(present, out / "hpn_training.png")
-    worlds = sorted({episode.scenario for episode in episodes}, key=lambda name: name != PICTURED)
+    worlds = sorted({episode.scenario for episode in episodes}, key=lambda name: name != PICTURE_SCENARIO)
     shown = map_figures.pictures(folder.path, out, weights, worlds[:1]) if weights else []
     page = [map_bench.markdown(table, compared), "## Pictures", ""]
     page += ["Errors against the horizon (P, figure 8):", "", "![errors](map_error.png)", ""]
@@ -112,11 +112,11 @@ def bench_maps(
 def measure(
     scores: Scores, recording: Recording, predictors: Sequence[Predictor], road: RoadMap | None = None
 ) -> None:
-    """Add one episode to the scores: every vehicle an AV perceives, once a second.
+    """Add one episode to the scores: every vehicle perceived by an AV, once a second.
 
-    With the `road`, `gp-indirect` is also led along the lanes (LED).
+    With the `road`, `gp-indirect` is also carried along the lanes (LED).
     """
-    w = windows(recording, every=EVERY, horizon=scores.steps)
+    w = windows(recording, every=FRAME_STRIDE, horizon=scores.steps)
     forecasts = {p.name: forecast(p, w.past) for p in predictors}
     for predictor in predictors:
         if road is not None and predictor.name == "gp-indirect":
@@ -143,8 +143,8 @@ def led(predictor: Predictor, w: Windows, road: RoadMap) -> Predicted:
 def forecast(predictor: Predictor, past: Floats) -> Predicted:
     """Forecasts of windows [S,N,4] (nan where unknown), in portions that fit into a processor's cache."""
     parts = []
-    for at in range(0, max(len(past), 1), PORTION):
-        part = past[at : at + PORTION]
+    for at in range(0, max(len(past), 1), CHUNK):
+        part = past[at : at + CHUNK]
         parts.append(predictor.predict(part, np.isfinite(part[:, :, 0])))
     f = KinematicForecast(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
     return Predicted(f.x, f.y, f.speed, f.heading, (f.speed_std, f.heading_std, f.along_std, f.across_std))
@@ -152,7 +152,7 @@ def forecast(predictor: Predictor, past: Floats) -> Predicted:
 
 def paired(scores: Scores) -> dict[str, Any]:
     """Each predictor against `gp-indirect` on the same episodes: difference of the mean error over the
-    horizon (m), per scenario; positive where it is worse."""
+    horizon (m), per scenario; positive if the predictor is worse."""
     reference = scores.errors.get("gp-indirect")
     found: dict[str, Any] = {}
     if reference is None:
@@ -215,7 +215,7 @@ def _coverage(coverage: Sequence[Mapping[str, Any]], horizons: Sequence[float]) 
     if not inside:
         return []
     lines = ["## Share of the truth inside the 90 % interval, all scenarios", ""]
-    lines += [f"Bold: more than {100 * TOLERATED:g} points off.", ""]
+    lines += [f"Bold: more than {100 * TOLERANCE:g} points off.", ""]
     lines += [_row(["predictor", "quantity", *(f"{h:g} s" for h in horizons)])]
     lines += [_row(["---"] * 2 + ["---:"] * len(horizons))]
     for name, quantity in dict.fromkeys(key[:2] for key in inside):
@@ -263,7 +263,7 @@ def _figure(row: Mapping[str, Any]) -> str:
 
 def _share(coverage: float) -> str:
     text = f"{100 * coverage:.1f} %"
-    return text if abs(coverage - LEVEL) <= TOLERATED or math.isnan(coverage) else f"**{text}**"
+    return text if abs(coverage - LEVEL) <= TOLERANCE or math.isnan(coverage) else f"**{text}**"
 
 
 def _row(cells: Sequence[str]) -> str:

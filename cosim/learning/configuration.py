@@ -1,4 +1,4 @@
-"""The configuration file of a training: one that ships, one's own, or what one's own changes of another."""
+"""The configuration file of a training: a shipped one, a user's own, or changes to another one."""
 
 import importlib.resources
 from pathlib import Path
@@ -11,17 +11,17 @@ from policy.training.config import TrainingFile
 
 
 class Configuration(NamedTuple):
-    """A whole configuration, whatever files it is from."""
+    """A complete configuration, merged from its files."""
 
-    values: object  # as YAML has it
+    values: object  # YAML data
     file: TrainingFile
 
 
 def configuration(name: str, beside: Path = Path(), above: tuple[Path, ...] = ()) -> Configuration:
     """A shipped configuration by name, or a file (relative to the folder `beside`).
 
-    `base: NAME` in a file names another one of which it changes only what it says; `above`: the files that
-    name this one so.
+    `base: NAME` in a file names a configuration to override; `above`: the files that name this one as their
+    base.
 
     Raises BadInput naming file, field and value.
     """
@@ -45,7 +45,7 @@ def configuration(name: str, beside: Path = Path(), above: tuple[Path, ...] = ()
 
 
 def _over(base: object, values: object) -> object:
-    """`values`, and what `base` has besides, section by section; an empty section changes nothing."""
+    """`base` overridden by `values`, section by section; an empty section changes nothing."""
     if values is None:
         return base
     if not isinstance(base, dict) or not isinstance(values, dict):

@@ -1,4 +1,4 @@
-"""Fits everything the kinematic predictors learn from recordings, and writes it with its card."""
+"""Fits of the kinematic predictors on recordings, written with their cards."""
 
 import hashlib
 import json
@@ -37,9 +37,9 @@ from policy.training.predictors import (
     net_loss,
 )
 
-EVERY = 5  # frames between two moments of an episode: 1 s, nearer ones are almost the same
-SCORED_EVERY = 10  # frames, on validation episodes
-NETS = {
+FRAME_STRIDE = 5  # frames between two samples of an episode: 1 s, closer ones are nearly equal
+VALIDATION_STRIDE = 10  # frames, on validation episodes
+NETWORKS = {
     "lstm-direct": NetConfig("lstm", "direct"),
     "lstm-indirect": NetConfig("lstm", "indirect"),
     "ae-direct": NetConfig("ae", "direct"),
@@ -49,7 +49,7 @@ PRIORS: dict[str, GaussianProcess] = {
     "gp-direct": GaussianProcessDirect,
     "gp-indirect": GaussianProcessIndirect,
 }
-FITTED = (*NETS, *PRIORS)
+FITTED = (*NETWORKS, *PRIORS)
 STEPS = 6000  # of 1024 windows each, for every predictor alike
 # the predictor, its networks and their configurations by name, how it was fitted
 Fitted = tuple[Predictor, tuple[dict[str, Any], dict[str, Any]], FitConfig]
@@ -63,10 +63,10 @@ def fit_predictors(
     steps: int = STEPS,
     state: Path | None = None,
 ) -> dict[str, dict[str, float]]:
-    """Fit `names` on the training seeds, calibrate and measure on the tuning seeds, write into `out`.
+    """Fit `names` on training seeds, calibrate and measure on validation seeds, write into `out`.
 
-    `state`: where every fit keeps its log and what it needs to go on after a kill. Returns what was measured.
-    Raises BadInput for recordings of other seeds: nothing is ever fitted on test seeds.
+    `state`: folder of every fit's log and resumable state. Returns the measured errors.
+    Raises BadInput for recordings of other seeds: test seeds are never used for fits.
     """
     keep_freed_memory()
     use_threads(1)
@@ -80,7 +80,7 @@ def fit_predictors(
     measured = {}
     for name in names:
         kept = None if state is None else state / name
-        fitted = _fit_net if name in NETS else _fit_prior
+        fitted = _fit_net if name in NETWORKS else _fit_prior
         with Progress(f"fit {name}", "steps") as progress:
             predictor, parts, config = fitted(name, learned, checked, steps, kept, progress)
         measured[name] = score(predictor, Folder(validation))
@@ -93,11 +93,11 @@ def _fit_net(
     name: str, learned: Windows, checked: Windows, steps: int, kept: Path | None, progress: Progress
 ) -> Fitted:
     config = FitConfig(steps=steps, learning_rate=2e-3)
-    network = fresh_net(NETS[name], config.seed)
+    network = fresh_net(NETWORKS[name], config.seed)
     examples, checks = examples_for_net(learned), examples_for_net(checked)
     fit(network, partial(net_loss, network), config, examples, checks, folder=kept, progress=progress)
-    predictor = Learned(NETS[name], weights=network)
-    return predictor, ({"network": network}, {"network": NETS[name]}), config
+    predictor = Learned(NETWORKS[name], weights=network)
+    return predictor, ({"network": network}, {"network": NETWORKS[name]}), config
 
 
 def _fit_prior(
@@ -112,19 +112,19 @@ def _fit_prior(
 
 
 def score(predictor: Predictor, folder: Folder) -> dict[str, float]:
-    """Position error in m on a folder of recordings, every scenario counting the same."""
+    """Position error in m on a folder of recordings, with equal weight of all scenarios."""
     scores = Scores(predictor.horizon, predictor.dt)
     for recording in folder.recordings():
-        w = windows(recording, every=SCORED_EVERY)
+        w = windows(recording, every=VALIDATION_STRIDE)
         scores.add(recording.case, w.future, {predictor.name: forecast(predictor, w.past)})
     rows = [r for r in scores.position_table() if r["scenario"] == "all" and r["behavior"] == "all"]
     return {f"position_error_{r['horizon_s']}": round(r["mean_m"], 4) for r in rows}
 
 
 def _calibrate(prior: PriorFit, checked: Windows) -> None:
-    """Set the prior's calibration: factors with which its intervals cover 90 % of the tuning episodes.
+    """Set the prior's calibration: factors with which its intervals cover 90 % of the validation episodes.
 
-    Once for each number of known frames: the same moments, with what lies before them hidden.
+    One calibration per number of known frames, on the same moments with earlier frames hidden.
     """
     predictor, factors = prior.fitted(), []
     for known in range(1, checked.past.shape[1] + 1):
@@ -139,8 +139,8 @@ def _calibrate(prior: PriorFit, checked: Windows) -> None:
 
 
 def _windows(folder: Folder) -> Windows:
-    """Every recording's moments; every scenario has the same total weight."""
-    parts = [(r.case["scenario"], windows(r, every=EVERY)) for r in folder.recordings()]
+    """The moments of all recordings, with equal total weight of all scenarios."""
+    parts = [(r.case["scenario"], windows(r, every=FRAME_STRIDE)) for r in folder.recordings()]
     scenario = np.concatenate([np.full(len(w.lane), name) for name, w in parts])
     _, group, count = np.unique(scenario, return_inverse=True, return_counts=True)
     return in_own_frame(
@@ -151,7 +151,7 @@ def _windows(folder: Folder) -> Windows:
 
 
 def _about(folder: Folder, allowed: range) -> dict[str, Any]:
-    """What the data were, for the card. Raises BadInput when a seed is not one of `allowed`."""
+    """The description of the data for the card. Raises BadInput for a seed outside of `allowed`."""
     found = folder.manifest()
     seeds = found["seeds"]
     if not all(seed in allowed for seed in seeds):

@@ -22,8 +22,8 @@ from policy.prediction.predictors import make_predictor
 from policy.training import hpn as trained
 from policy.training.networks import use_threads
 
-FORECAST = "gp-raster"  # the maps that the kinematic forecast alone gives
-STRIDE = 10  # decisions, 4 s: nearer ones look at almost the same traffic
+FORECAST = "gp-raster"  # maps of the uncorrected kinematic forecast
+STRIDE = 10  # decisions, 4 s: closer ones show nearly the same traffic
 
 
 class EpisodeErrors(NamedTuple):
@@ -37,13 +37,13 @@ class EpisodeErrors(NamedTuple):
 
 
 def hpn_weights() -> dict[str, Path]:
-    """The HPNs that are shipped, by name; those that are not there are left out."""
+    """The shipped HPNs by name, without missing files."""
     found = {name: SHIPPED / f"{name}.safetensors" for name in trained.VARIANTS}
     return {name: path for name, path in found.items() if path.is_file()}
 
 
 class MapMeter(EpisodeReader):
-    """Runs in a worker: predicts maps on recorded episodes and compares them with what followed."""
+    """Runs in a worker: predicts maps on recorded episodes and compares them with the true maps."""
 
     def __init__(self, weights: Mapping[str, str], stride: int) -> None:
         super().__init__()
@@ -97,7 +97,7 @@ def measure(
     stride: int = STRIDE,
     workers: int = 1,
 ) -> list[EpisodeErrors]:
-    """Every episode of a folder of recordings. Raises BadInput when nothing is left to measure."""
+    """Measure every episode of a folder of recordings. Raises BadInput without usable episodes."""
     source = Folder(folder)
     keys = [
         key
@@ -142,15 +142,15 @@ def rows(episodes: Sequence[EpisodeErrors]) -> list[dict[str, Any]]:
 
 
 def _by_world(episodes: Sequence[EpisodeErrors]) -> Iterator[tuple[str, list[EpisodeErrors]]]:
-    """The episodes of each world, then all."""
+    """The episodes of each scenario, then all."""
     for world in (*sorted({e.scenario for e in episodes}), "all"):
         yield world, [e for e in episodes if world in ("all", e.scenario)]
 
 
 def against(episodes: Sequence[EpisodeErrors], ours: str = "hpn") -> list[dict[str, Any]]:
-    """How `ours` differs from every other predictor, relative to it, on the same episodes and over HORIZONS.
+    """Relative difference of `ours` to every other predictor, on the same episodes and over HORIZONS.
 
-    PRE below 0 and IoU above 0 say that ours is better; `everywhere`: at every horizon in the mean.
+    With PRE below 0 and IoU above 0 `ours` is better; `everywhere`: at every horizon in the mean.
     """
     out: list[dict[str, Any]] = []
     for world, here in _by_world(episodes):
@@ -172,7 +172,7 @@ def against(episodes: Sequence[EpisodeErrors], ours: str = "hpn") -> list[dict[s
 
 
 def markdown(table: Sequence[Mapping[str, Any]], compared: Sequence[Mapping[str, Any]] = ()) -> str:
-    """The tables for people: what the HPN gains on the others, and PRE and IoU over all scenarios."""
+    """The tables in Markdown: the HPN's gain over the others, and PRE and IoU over all scenarios."""
     total = [row for row in table if row["scenario"] == "all"]
     lines = ["# Predicted maps", ""]
     if compared:
@@ -198,7 +198,7 @@ def markdown(table: Sequence[Mapping[str, Any]], compared: Sequence[Mapping[str,
 
 
 def _verdict(compared: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Whether the HPN's maps are better than those drawn from the kinematic forecast."""
+    """Whether the HPN's maps are better than the maps of the kinematic forecast."""
     overall = {row["against"]: row for row in compared if row["scenario"] == "all"}
     row = overall.get(FORECAST)
     if row is None:

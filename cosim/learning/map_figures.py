@@ -16,11 +16,11 @@ from cosim.recording.file import read
 from cosim.recording.folder import Folder
 from cosim.road import RoadMap
 from cosim.types import COMPACT, Bytes, Floats32
-from policy.chain.inner_features import painted
+from policy.chain.inner_features import feature_pictures
 from policy.chain.map_error import MapPredictors, frame_of, unit_maps, vehicle_channels
 from policy.prediction.predictors import make_predictor
 
-SHOWN = (0.2, 1.0, 2.0, 3.0, 4.0)  # s, columns of a chain's picture
+SHOWN_HORIZONS = (0.2, 1.0, 2.0, 3.0, 4.0)  # s, columns of a chain's picture
 STYLE = {"hpn": "-", "hpn-no-history": "--", "hpn-plain": ":", "last-frame": "-.", "gp-raster": "-"}
 DPI = 110
 
@@ -46,7 +46,7 @@ def training(logs: Mapping[str, Path], out: Path) -> None:
 
 
 def errors(table: Sequence[Mapping[str, Any]], out: Path) -> None:
-    """PRE and IoU over the horizon, a column per world (the numbers behind P's figure 8)."""
+    """PRE and IoU over the horizon, a column per scenario (the data of P's figure 8)."""
     worlds = list(dict.fromkeys(r["scenario"] for r in table))
     figure = Figure(figsize=(2.7 * len(worlds), 5.2), layout="constrained")
     axes = figure.subplots(2, len(worlds), squeeze=False, sharex=True)
@@ -69,8 +69,8 @@ def errors(table: Sequence[Mapping[str, Any]], out: Path) -> None:
 def pictures(
     folder: Path, out: Path, weights: Mapping[str, Path], scenarios: Sequence[str] = ()
 ) -> list[Path]:
-    """For every world one decision of one recording: the chain's output beside what followed (P, figures 8
-    and 10) and what goes on inside the networks (P, figure 7). Returns the files."""
+    """For every scenario one decision of one recording: the chain's output beside the truth (P, figures 8
+    and 10) and the networks' inner features (P, figure 7). Returns the files."""
     source, hpns = Folder(folder), load_hpns(weights)
     if not hpns:
         raise BadInput("there are no trained HPNs to show", field="weights")
@@ -95,7 +95,7 @@ def pictures(
 
 
 def _interest(now: Followed, av: str) -> float:
-    """How much there is to see: vehicles in the picture, and how far they move in it."""
+    """The interest of a picture: number of vehicles, and their motion in it."""
     channels = vehicle_channels(COMPACT)
     maps = now.maps[av][:, channels].astype(np.float32)
     return float(
@@ -116,10 +116,10 @@ def picture(maps: Floats32 | Bytes) -> Floats32:
 def _chain(now: Followed, av: str, predictors: MapPredictors, world: str, out: Path) -> None:
     guess = predictors.predict(now.histories)
     b = guess.agents.index(av)
-    at = [frame_of(h) for h in SHOWN]
+    at = [frame_of(h) for h in SHOWN_HORIZONS]
     lines = [("what followed", now.maps[av][at])] + [(n, m[b, at]) for n, m in guess.maps.items()]
     figure, axes = _grid(len(lines), len(at))
-    for axis, horizon in zip(axes[0], SHOWN, strict=True):
+    for axis, horizon in zip(axes[0], SHOWN_HORIZONS, strict=True):
         axis.set_title(f"{world}, {horizon:g} s ahead", fontsize="small")
     for row, (name, maps) in zip(axes, lines, strict=True):
         _show(row, name, [picture(one) for one in maps])
@@ -143,7 +143,7 @@ def _show(row: Any, name: str, images: Iterable[Floats32]) -> None:
 
 
 def _features(now: Followed, av: str, hpns: Mapping[str, Any], road: RoadMap, world: str, out: Path) -> None:
-    found = painted(hpns, now.histories, av, COMPACT, road, make_predictor("gp-indirect", 20, 0.2))
+    found = feature_pictures(hpns, now.histories, av, COMPACT, road, make_predictor("gp-indirect", 20, 0.2))
     columns = 4
     rows = [
         (name, maps[at : at + columns])

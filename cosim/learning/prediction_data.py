@@ -1,4 +1,4 @@
-"""Recordings as the predictor's data: decisions with the maps and states that really followed."""
+"""Recordings as the predictor's data: decisions with the true future maps and states."""
 
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,7 +23,7 @@ MAPLESS = replace(COMPACT, maps=False)
 
 
 class Followed(NamedTuple):
-    """One decision of a recorded episode and what came of it."""
+    """One decision of a recorded episode and its true future."""
 
     frame: int
     histories: dict[str, History]
@@ -34,9 +34,9 @@ class Followed(NamedTuple):
 def followed(
     recording: Recording, road: RoadMap, observation: ObservationConfig, stride: int, first: int = 0
 ) -> Iterator[Followed]:
-    """Every `stride`th decision, from number `first` on, that the recording follows for the whole horizon.
+    """Every `stride`th decision, from number `first` on, with a recorded future over the whole horizon.
 
-    Decisions at which no AV knew anything are left out. Histories are copies and may be kept.
+    Decisions without an observing AV are left out. Histories are copies and may be kept.
     """
     snapshots = recording.snapshots()
     waiting: list[tuple[int, dict[str, History]]] = []
@@ -68,7 +68,7 @@ def episodes(folders: list[Path]) -> list[tuple[Path, str]]:
 
 
 def recorded_by(manifest: Mapping[str, Any]) -> list[str]:
-    """The commands that drove a folder's episodes, without where they wrote: that is no part of the data."""
+    """The commands that recorded a folder's episodes, without their output folders."""
     commands = set()
     for command in manifest["commands"]:
         words = [w for k, w in enumerate(command) if "--out" not in (w, *command[max(k - 1, 0) : k])]
@@ -77,7 +77,7 @@ def recorded_by(manifest: Mapping[str, Any]) -> list[str]:
 
 
 class EpisodeReader:
-    """What runs in a worker and reads recorded episodes."""
+    """Runs in a worker and reads recorded episodes."""
 
     def __init__(self) -> None:
         self._folders: dict[str, Folder] = {}
@@ -89,11 +89,11 @@ class EpisodeReader:
         return recording, folder.road(recording)
 
     def close(self) -> None:
-        """Nothing to end."""
+        """Nothing to close."""
 
 
 def spread(engine: Engine, tasks: Sequence[Task], title: str) -> list[Any]:
-    """What each task returned, in the order of the tasks. Raises CosimError for the first that failed."""
+    """The result of each task, in the order of the tasks. Raises CosimError for the first failure."""
     found: dict[str, Any] = {}
     for outcome in shown(engine.run(tasks), len(tasks), title, "episodes"):
         if not outcome.ok:

@@ -1,4 +1,4 @@
-"""How good forecasts of vehicles are: position error and interval coverage, episode by episode."""
+"""Scores of vehicle forecasts: position error and interval coverage, episode by episode."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,13 +10,13 @@ from cosim.report import statistics
 from cosim.types import Floats
 
 LEVEL = 0.9  # nominal coverage of an interval
-NORMAL = 1.645  # its half width in standard deviations
+LEVEL_DEVIATIONS = 1.645  # half width in standard deviations
 REPORTED = (0.2, 0.4, 1.0, 2.0, 3.0, 4.0)  # s (observation.md, Clocks)
 QUANTITIES = ("speed", "heading", "along", "across")  # the last two: position, in driving direction and aside
 
 
 class Predicted(NamedTuple):
-    """Forecasts of S moments of single vehicles, M frames ahead; spread 0 where the predictor knows none."""
+    """Forecasts of S moments of single vehicles, M frames ahead; spread 0 for predictors without one."""
 
     x: Floats  # [S,M] m
     y: Floats  # [S,M] m
@@ -26,13 +26,13 @@ class Predicted(NamedTuple):
 
 
 def position_error(predicted: Predicted, future: Floats) -> Floats:
-    """Distance between forecast and truth [S,M] in m; future [S,M,4] x y speed heading, nan once it is gone.
-    P's PE before the mean is taken."""
+    """Distance between forecast and truth [S,M] in m; future [S,M,4] x y speed heading, nan after the vehicle
+    left. P's PE before averaging."""
     return np.asarray(np.hypot(predicted.x - future[:, :, 0], predicted.y - future[:, :, 1]))
 
 
 def interval_errors(predicted: Predicted, future: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """What the intervals of QUANTITIES have to cover: errors [S,M] each, nan where there is no truth."""
+    """Errors [S,M] to be covered by the intervals of QUANTITIES, nan without truth."""
     dx, dy = future[:, :, 0] - predicted.x, future[:, :, 1] - predicted.y
     c, s = np.cos(predicted.heading), np.sin(predicted.heading)
     turn = (future[:, :, 3] - predicted.heading + np.pi) % (2 * np.pi) - np.pi
@@ -52,7 +52,7 @@ class Scores:
     widths: dict[str, list[Floats]] = field(default_factory=dict)  # -> per episode [4,M]
 
     def add(self, case: Mapping[str, Any], future: Floats, forecasts: Mapping[str, Predicted]) -> None:
-        """One episode: what was true, what each predictor said."""
+        """Add one episode: truth, and each predictor's forecast."""
         self.cases.append(case)
         self.counts.append(np.isfinite(future[:, :, 0]).sum(0).astype(np.float64))
         for name, predicted in forecasts.items():
@@ -64,8 +64,8 @@ class Scores:
             width = np.full_like(inside, np.nan)
             for q, (error, std) in enumerate(zip(missed, predicted.std, strict=True)):
                 if std.any():
-                    hit = np.where(np.isfinite(error), np.abs(error) <= NORMAL * std, np.nan)
-                    inside[q], width[q] = _mean(hit), 2.0 * NORMAL * std.mean(0)
+                    hit = np.where(np.isfinite(error), np.abs(error) <= LEVEL_DEVIATIONS * std, np.nan)
+                    inside[q], width[q] = _mean(hit), 2.0 * LEVEL_DEVIATIONS * std.mean(0)
             self.covered.setdefault(name, []).append(inside)
             self.widths.setdefault(name, []).append(width)
 
@@ -87,8 +87,8 @@ class Scores:
         """Rows of position_error.csv. `horizon_s` is a time, or "mean": over the whole horizon.
 
         The mean is over episodes, of each episode's mean over vehicles and moments; its interval is
-        bootstrapped over episodes, for vehicles of one episode are not independent. "all" scenarios: every
-        scenario counts the same. `n`: forecasts.
+        bootstrapped over episodes, because vehicles of one episode are not independent. "all" scenarios:
+        equal weight of all scenarios. `n`: forecasts.
         """
         rows = []
         spans: dict[float | str, slice] = {h: slice(k, k + 1) for h, k in self.horizons().items()}
@@ -143,7 +143,7 @@ class Scores:
         return rows
 
     def _balanced(self, values: Floats, members: list[int], scenario: str) -> Floats:
-        """Episodes of "all" scenarios weighted so that each scenario counts the same, whatever its number."""
+        """Values weighted so that each scenario has equal weight in "all", for any number of episodes."""
         if scenario != "all":
             return values
         names = [str(self.cases[i]["scenario"]) for i in members]
@@ -152,7 +152,7 @@ class Scores:
 
 
 def _mean(values: Floats) -> Floats:
-    """Mean over the first axis of what is there; nan where nothing is."""
+    """Mean over the first axis without nan; nan if all are nan."""
     there = np.isfinite(values)
     total = np.where(there, values, 0.0).sum(0)
     return np.asarray(np.where(there.any(0), total / np.maximum(there.sum(0), 1), np.nan))

@@ -22,7 +22,7 @@ from cosim.workers.supervisor import Limits, Supervisor
 from cosim.workers.tasks import Task
 from policy.agents.approaches import AgentConfig
 from policy.checkpoint import load as load_weights
-from policy.training.curriculum import Drive, Drove, Lesson
+from policy.training.curriculum import Drive, DriveResult, Lesson
 from policy.training.explorer import ExploreConfig, Explorer
 
 FIGURES = (
@@ -35,7 +35,7 @@ FIGURES = (
     "hard_brakings_av",
     "av_caused_collisions",
 )
-LIMITS = Limits(step=300.0, crashes=3)  # a drive is its iteration's: it is tried three times
+LIMITS = Limits(step=300.0, crashes=3)  # an iteration needs all of its episodes: three attempts
 
 
 class Rollout(Hosts):
@@ -57,15 +57,15 @@ class Rollout(Hosts):
         self._reward, self._metrics = read(reward), metrics
         self._loaded: dict[str, str] = {}
 
-    def run(self, drive: Drive, progress: Any = None) -> Drove:
-        """One whole episode; with metrics of a user's every figure of it is logged."""
+    def run(self, drive: Drive, progress: Any = None) -> DriveResult:
+        """One whole episode; with a user's metrics every figure is logged."""
         episode, agent = self.episode(drive.lesson, drive.errors, drive.preset), self.agent
         self._weights("vfn", agent.vfn, drive.weights)
         self._weights("frozen", agent.frozen, drive.frozen)
         return drive_episode(episode, agent, drive, self._reward, progress, every=bool(self._metrics))
 
     def episode(self, lesson: Lesson, errors: str = "", preset: str = Preset.UNGUARDED) -> Episode:
-        """Where this lesson is driven, among drivers who err so: that of the last one if it is the same."""
+        """The episode object of this lesson and error level, reused from the last lesson if equal."""
 
         def build() -> Host:
             scenario = load(
@@ -86,14 +86,14 @@ class Rollout(Hosts):
 
 
 class Payments(Earnings):
-    """What every commanded AV earns; the learning agent is paid."""
+    """Rewards of every commanded AV, passed to the learning agent."""
 
     def __init__(self, agent: Explorer, drive: Drive, reward: Reward) -> None:
         super().__init__(reward, drive.svo)
         self._agent, self._drive = agent, drive
 
     def on_start(self, episode: Episode) -> None:
-        """The agent begins to explore and to remember."""
+        """Start the agent's exploration and recording."""
         d, seed = self._drive, episode.seed
         label = f"{d.lesson.scenario}/{d.lesson.demand}/{seed}"
         self._agent.episode(label, d.epsilon, generator(seed, "explore"), d.record, d.keep)
@@ -114,27 +114,27 @@ def drive_episode(
     progress: Any = None,
     *,
     every: bool = False,
-) -> Drove:
-    """One whole episode with the learning agent; its networks are as they are. `every`: all its figures."""
+) -> DriveResult:
+    """One whole episode with the learning agent and its present networks. `every`: return all figures."""
     earned = Payments(agent, drive, reward)
     result = run_episode(episode, agent, drive.seed, svo=drive.svo, progress=progress, hooks=[earned])
-    agent.decide(episode.histories)  # the last state is decided upon too: its mask is needed
+    agent.decide(episode.histories)  # the last state needs a decision for its mask
     trajectories = agent.finish()
     figures: dict[str, float | None] = {
         name: None if (v := result.value(name)) is None else float(v)
         for name in (result.metrics if every else FIGURES)
     }
-    # a crash ends the episode: the decisions that were not driven count as nothing earned
+    # after a crash the remaining decisions count as reward 0
     planned = round(episode.scenario.duration / episode.scenario.timing.decision)
     avs = len(earned.totals) / max(result.steps, 1)
     figures["reward"] = float(np.sum(earned.totals)) / max(avs * planned, 1.0)
     figures["steps"] = float(result.steps)
     figures |= {name: float(s) for name, s in result.timings.items()}
-    return Drove(trajectories, figures)
+    return DriveResult(trajectories, figures)
 
 
 class Rollouts(contextlib.AbstractContextManager["Rollouts"]):
-    """`policy.training.vfn.Actors` on `workers` supervised processes, supervised as those of a batch are."""
+    """`policy.training.vfn.Actors` on `workers` supervised processes, as in a batch."""
 
     def __init__(self, workers: int, *factory: Any) -> None:
         self._factory = factory
@@ -142,8 +142,8 @@ class Rollouts(contextlib.AbstractContextManager["Rollouts"]):
         self._supervisors: list[Supervisor] = []
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="rollout")
 
-    def submit(self, drive: Drive) -> Future[Drove]:
-        """Drive it on the next free process.
+    def submit(self, drive: Drive) -> Future[DriveResult]:
+        """Drive the episode on the next free process.
 
         The future raises SimulationCrashed when the process ended or hung as often as `LIMITS` allow.
         """
@@ -158,9 +158,9 @@ class Rollouts(contextlib.AbstractContextManager["Rollouts"]):
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def _drive(self, drive: Drive) -> Drove:
+    def _drive(self, drive: Drive) -> DriveResult:
         if not hasattr(self._local, "supervisor"):
             self._local.supervisor = Supervisor(Rollout, self._factory, LIMITS)
             self._supervisors.append(self._local.supervisor)
-        drove: Drove = self._local.supervisor.run(Task("", "", (drive,))).result()
+        drove: DriveResult = self._local.supervisor.run(Task("", "", (drive,))).result()
         return drove

@@ -1,4 +1,4 @@
-"""Training of the frame encoder on drives of its own: `cosim train encoder`."""
+"""Training of the frame encoder on its own episodes: `cosim train encoder`."""
 
 import argparse
 import math
@@ -30,14 +30,14 @@ from policy.training import sight
 from policy.training.config import agent_config, encoder_of
 from policy.training.loop import LoopConfig
 from policy.training.networks import use_threads
-from policy.training.sight import AVS, ERRORS, EVERY, Seen, SightTask
+from policy.training.sight import AVS_PER_DECISION, DECISION_STRIDE, ERROR_LEVEL, Seen, SightTask
 from sumo_scenarios import names
 
-HELD = 6.0  # decisions for which a random action is held on average
+HELD_DECISIONS = 6.0  # mean decisions that a random action is held
 
 
 class Watcher(PredictionAware):
-    """Keeps what AVs see and what they know; SUMO drives them, or random actions that the prioritizer allows.
+    """Records the AVs' maps and labels; AVs are driven by SUMO or by safe random actions.
 
     Args:
         agent: sizes, chain and prioritizer.
@@ -47,23 +47,23 @@ class Watcher(PredictionAware):
         super().__init__("vfn-p", agent)
 
     def watch(self, world: int, seed: int, acts: bool) -> None:
-        """A new drive in the scenario number `world`; `acts`: the AVs are driven at random."""
+        """Start an episode in scenario number `world`; `acts`: the AVs act at random."""
         self._world, self._acts, self._rng = world, acts, generator(seed, "watch")
         self._held: dict[str, MetaAction] = {}
         self._count = 0
         self.parts: list[Seen] = []
 
     def reset(self, context: PolicyContext) -> None:
-        """A new episode; every time to collision is worked out, whoever keeps the distance."""
+        """Start an episode; times to collision are computed even if the car keeps its distance itself."""
         super().reset(context)
         self._safety = self.config.safety
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
-        """Looks now and then; what it decided is held meanwhile."""
+        """Decide every few decisions and hold the action in between."""
         self._count += 1
         if not histories:
             return {}
-        if self._count % EVERY == 0:
+        if self._count % DECISION_STRIDE == 0:
             self._look(histories)
         return {av: Decision(self._held.get(av, MetaAction.IDLE)) for av in histories} if self._acts else {}
 
@@ -72,9 +72,9 @@ class Watcher(PredictionAware):
         agents, actions = inputs.scene.agents, len(MetaAction)
         decided = self.choose(self._rng.random((len(agents), actions)).astype(np.float32), inputs)
         for av in agents:
-            if av not in self._held or self._rng.random() < EVERY / HELD:
+            if av not in self._held or self._rng.random() < DECISION_STRIDE / HELD_DECISIONS:
                 self._held[av] = decided[av].action
-        rows = self._rng.permutation(len(agents))[:AVS]
+        rows = self._rng.permutation(len(agents))[:AVS_PER_DECISION]
         past, states = self.observation.frames, inputs.states
         maps, kinematics, situation = (part.numpy()[rows] for part in states[:3])
         ttc = np.array([decided[agents[row]].ttc for row in rows], np.float32)
@@ -83,7 +83,7 @@ class Watcher(PredictionAware):
 
 
 class Watching(Hosts):
-    """Runs in a worker: one drive, and what was seen in it."""
+    """Runs in a worker: one episode and its recorded frames."""
 
     def __init__(self, agent: AgentConfig) -> None:
         super().__init__()
@@ -92,7 +92,7 @@ class Watching(Hosts):
     def run(
         self, world: str, index: int, demand: str, seed: int, errors: str, progress: Any = None
     ) -> list[Seen]:
-        """Every second drive by its seed is driven at random, the others by SUMO."""
+        """Episodes alternate by seed between random actions and SUMO."""
 
         def build() -> Host:
             return Host(load(world, demand=[demand], errors=errors or None), self._watcher, math.pi / 4)
@@ -104,12 +104,12 @@ class Watching(Hosts):
 
 
 def gather(agent: AgentConfig, worlds: Sequence[str], seeds: range, workers: int, title: str) -> Seen:
-    """What is seen in drives with `seeds` of every demand of `worlds`; humans err in every second one."""
+    """Frames of episodes with `seeds` of every demand of `worlds`, every second with human errors."""
     tasks = [
         Task(f"{world}/{demand}/{seed}", f"{world}/{demand}/{errors}", (world, index, demand, seed, errors))
         for index, world in enumerate(worlds)
         for demand in load(world).demands or {}
-        for errors in ("", ERRORS)
+        for errors in ("", ERROR_LEVEL)
         for seed in seeds
         if (seed % 2 == 1) == bool(errors)
     ]
@@ -118,7 +118,7 @@ def gather(agent: AgentConfig, worlds: Sequence[str], seeds: range, workers: int
 
 
 def train(args: argparse.Namespace) -> int:
-    """`cosim train encoder`. Raises BadInput for whatever is wrong before anything is driven."""
+    """`cosim train encoder`. Raises BadInput for invalid input before the first episode."""
     for flag in ("iterations", "reward", "metric", "errors"):
         if getattr(args, flag):
             raise BadInput("is not for the encoder", field=f"--{flag}", value=getattr(args, flag))

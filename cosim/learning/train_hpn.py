@@ -31,7 +31,7 @@ from policy.training.networks import use_threads
 
 
 def train(args: argparse.Namespace) -> int:
-    """`cosim train hpn`. Raises BadInput for whatever is wrong before anything is computed."""
+    """`cosim train hpn`. Raises BadInput for invalid input before any computation."""
     file = configuration(args.config).file
     name, training, seed = args.variant, file.prediction, args.seed or 0
     if not args.recordings or not args.validation:
@@ -72,7 +72,7 @@ def train(args: argparse.Namespace) -> int:
 
 
 def _commands(args: argparse.Namespace, found: Mapping[str, Sequence[tuple[Path, str]]]) -> dict[str, Any]:
-    """How to train the same again, for the card: the training's command, and those of its recordings."""
+    """The commands that reproduce the training, for the card: of the training and its recordings."""
     seed = "" if args.seed is None else f" --seed {args.seed}"
     recorders = {
         f"{part} recordings": [
@@ -97,14 +97,14 @@ class Gatherer(EpisodeReader):
         self._predictor = make_predictor("gp-indirect", 20, 0.2)
 
     def run(self, path: str, key: str, progress: object = None) -> list[Moment] | list[MapSample]:
-        """Everything that one episode gives."""
+        """All examples of one episode."""
         recording, road = self.read(path, key)
         seed, t = int(recording.case["seed"]), self._training
         if self._variant.maps == "plain":
             return [
                 map_sample(at.histories[name], at.maps[name], at.future)
                 for at in followed(recording, road, COMPACT, t.map_stride, seed)
-                for name in sorted(at.maps)[seed % 2 :: 4]  # every fourth AV: allies see the same cars
+                for name in sorted(at.maps)[seed % 2 :: 4]  # every fourth AV: AVs share most vehicles
             ]
         seen = self._variant.kinematic.history
         return [
@@ -116,7 +116,7 @@ class Gatherer(EpisodeReader):
 def _gather(
     keys: Sequence[tuple[Path, str]], variant: str, training: hpn.HpnTraining, workers: int, part: str
 ) -> list[Any]:
-    """Examples of every episode, in the order of the keys whichever worker was faster."""
+    """Examples of every episode, in the order of the keys."""
     tasks = [Task(f"{path} {key}", str(path), (str(path), key)) for path, key in keys]
     found = spread(LocalEngine(Gatherer, (variant, training), workers=workers), tasks, f"read {part}")
     flat = [example for examples in found for example in examples]
@@ -140,7 +140,7 @@ def _checked(paths: Sequence[str], seeds: range, field: str) -> list[tuple[Path,
 
 
 def _manifest(keys: Sequence[tuple[Path, str]]) -> dict[str, Any]:
-    """What data it was, short enough for a card: how it was recorded, how much of it, and a hash."""
+    """A short description of the data for a card: recording commands, amount and hash."""
     names = sorted(key for _, key in keys)
     seeds = [seed_of(name) for name in names]
     folders = [Folder(path).manifest() for path in sorted({path for path, _ in keys})]
@@ -153,7 +153,7 @@ def _manifest(keys: Sequence[tuple[Path, str]]) -> dict[str, Any]:
 
 
 def check(args: argparse.Namespace) -> None:
-    """Refuse flags that say nothing to an HPN. Raises BadInput."""
+    """Refuse flags that do not apply to an HPN. Raises BadInput."""
     for flag in ("iterations", "reward", "metric", "errors"):
         if getattr(args, flag):
             raise BadInput("is not for hpn", field=f"--{flag}", value=getattr(args, flag))

@@ -30,11 +30,11 @@ from policy.training.networks import usable, use_threads
 from policy.training.vfn import TrainingRun
 from sumo_scenarios import names
 
-WEIGHTS = {"contested": 2.0, "dense": 1.0}  # altruism is learned where an AV must yield
+WEIGHTS = {"contested": 2.0, "dense": 1.0}  # weights of demands: altruism is learned where an AV must yield
 
 
 def train(args: argparse.Namespace) -> int:
-    """`cosim train NAME` for an agent. Raises BadInput for whatever is wrong before anything is driven."""
+    """`cosim train NAME` for an agent. Raises BadInput for invalid input before the first episode."""
     values, file = configuration(args.config)
     name = args.what
     agent = agent_config(name, file)
@@ -70,7 +70,7 @@ def train(args: argparse.Namespace) -> int:
             announced.recorded = run.trainer.replay.size
             (folder / "config.yaml").write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
             run.run(progress)
-        # as `--policy` wants the folder: a bare word would be a policy that ships
+        # a path for `--policy`: a bare word would name a shipped policy
         typed = shlex.quote(args.out if "/" in args.out else f"./{args.out}")
         best = f", best validation reward {run.best:.3f}" if math.isfinite(run.best) else ""
         print(f"{name}: {run.iteration} iterations, {run.trainer.learner.updates} updates{best}")
@@ -79,7 +79,7 @@ def train(args: argparse.Namespace) -> int:
 
 
 def _scheduled(training: VfnTraining, args: argparse.Namespace) -> VfnTraining:
-    """The file's schedule with what the command line says otherwise."""
+    """The file's schedule, overridden by the command line."""
     worlds = names() if "all" in args.scenario else tuple(map(place, args.scenario))
     if worlds:
         lessons = tuple(lesson for world in worlds for lesson in _lessons(world))
@@ -104,7 +104,7 @@ def _users(training: VfnTraining, args: argparse.Namespace) -> tuple[str, tuple[
 
 
 def _lessons(world: str) -> list[Lesson]:
-    """Its contested and dense demands, or all that it has. Raises BadInput where it has none by name."""
+    """The scenario's contested and dense demands, else all. Raises BadInput without named demands."""
     known = load(world).demands
     if not known:
         raise BadInput("has no demands by name to train on", field="--scenario", value=world)

@@ -72,7 +72,7 @@ class Metrics:
         self.had_avs = False  # whether an AV was ever on the road
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
-        """A new episode begins with its first frame."""
+        """Start an episode with its first frame."""
         self.had_avs = bool((first.kind == Kind.AV).any())
         for metric in self._metrics:
             metric.reset(first, context)
@@ -85,7 +85,7 @@ class Metrics:
 
     @property
     def offences(self) -> list[Offence]:
-        """What AVs did against the law so far, by time."""
+        """Offences of AVs so far, by time."""
         found = [o for metric in self._metrics if isinstance(metric, AvCounts) for o in metric.offences]
         return sorted(found, key=lambda o: o.time)
 
@@ -98,9 +98,9 @@ class Metrics:
 
 
 def joined(figures: Mapping[str, Metric], more: object, file: object = None) -> dict[str, Metric]:
-    """`figures`, and those of another metric, whose code is in `file`.
+    """`figures` and the figures `more` of another metric, with code in `file`.
 
-    Raises BadInput: it has no mapping of names to `Metric`, a name that is taken, a value that is no number.
+    Raises BadInput unless it is a mapping of free names to `Metric`, each with a numeric value.
     """
     if not isinstance(more, Mapping):
         raise BadInput("must return a mapping of names to cosim.types.Metric", file=file, field="result")
@@ -114,9 +114,9 @@ def joined(figures: Mapping[str, Metric], more: object, file: object = None) -> 
 
 
 def read(what: str | MetricFactory, field: str = "--metric") -> MetricFactory:
-    """What makes the metric of the class FILE.py:NAME or MODULE:NAME; a class or factory is that already.
+    """The factory of a metric from FILE.py:NAME or MODULE:NAME; a class or factory is returned unchanged.
 
-    Those of `METRICS` are measured in any case. Raises BadInput: its code cannot be loaded.
+    `METRICS` are measured in any case. Raises BadInput when the code cannot be loaded.
     """
     if not isinstance(what, str):
         return what

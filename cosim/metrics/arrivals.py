@@ -5,7 +5,7 @@ from cosim.types import Metric, Snapshot
 
 
 class Arrivals:
-    """Wrecks that were taken off the road have not arrived."""
+    """Counts of arrivals, without wrecks that were taken off the road."""
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._everybody = context.everybody

@@ -1,4 +1,4 @@
-"""Collisions: C% of the papers (`crashed`), who was in them, and who was to blame."""
+"""Collisions: C% of the papers (`crashed`), the vehicles involved, and the cause."""
 
 from cosim.metrics.context import MetricContext
 from cosim.types import Collision, Metric, Snapshot

@@ -1,4 +1,4 @@
-"""Distance driven: means by kind of vehicle (DT of both papers), and what all of them drove in sum."""
+"""Distance driven: means by kind of vehicle (DT of both papers), and the total of all vehicles."""
 
 import numpy as np
 import numpy.typing as npt
@@ -12,10 +12,9 @@ from cosim.types import Bools, Floats, Ints, Metric, Snapshot
 class Distance:
     """Mean over vehicles of the metres driven in the counted time (figures.md, Mission and distance).
 
-    The vehicles are those on the road at the first frame, so that a policy cannot change which vehicles are
-    counted; a vehicle that left keeps its distance. On a road that starts empty (a foreign scenario without
-    warm-up) they are all that ever appeared. The mission vehicle counts whenever it appears. Kilometres
-    are of all vehicles, whenever they appeared.
+    The vehicles on the road at the first frame are counted, so that the policy does not affect their choice.
+    A vehicle that left keeps its distance. On a road that starts empty (a foreign scenario without warm-up)
+    all vehicles are counted. The mission vehicle always counts. Kilometres are of all vehicles.
     """
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
@@ -61,7 +60,7 @@ def _drive(
     frame: int,
     elapsed: float,
 ) -> None:
-    """Add the trapezoid of the speeds to each vehicle's distance; positions would count a teleport's jump."""
+    """Integrate the speeds by the trapezoid rule; positions would include the jump of a teleport."""
     for k in range(len(slot)):
         row = tally[slot[k]]
         if frame > 1 and row[0] == frame - 1:

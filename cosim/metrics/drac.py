@@ -1,5 +1,5 @@
-"""DRAC: the hardest constant braking that an AV or mission vehicle, or its opponent, would have needed;
-how often anybody would have needed a hard one."""
+"""DRAC: the largest constant deceleration required by an AV or mission vehicle, or its opponent; and the
+near-misses of all vehicles by DRAC."""
 
 from cosim.metrics.context import MetricContext
 from cosim.metrics.near_misses import NearMisses
@@ -9,7 +9,7 @@ from cosim.types import Metric, Snapshot
 class DecelerationRate:
     """Largest over frames and pairs; overlapping pairs (a collision already) are not counted.
 
-    NA when no such vehicle was there, 0 when none was ever on a collision course.
+    NA without such a vehicle, 0 without a collision course.
     """
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:

@@ -1,11 +1,11 @@
-"""CO2 of all vehicles by SUMO's emission model, in all and per distance."""
+"""CO2 of all vehicles by SUMO's emission model, total and per distance."""
 
 from cosim.metrics.context import MetricContext
 from cosim.types import Metric, Snapshot
 
 
 class Emissions:
-    """What a frame emits it emits since the frame before; NA where SUMO does not tell."""
+    """The rate of a frame holds since the previous frame; NA if SUMO reports no emissions."""
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._time = first.time

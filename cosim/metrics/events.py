@@ -1,4 +1,4 @@
-"""Teleports and emergency stops: three different things with collisions, so three figures (sumo.md)."""
+"""Teleports and emergency stops, reported separately from collisions (sumo.md)."""
 
 from cosim.metrics.context import MetricContext
 from cosim.types import Metric, Snapshot

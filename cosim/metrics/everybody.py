@@ -1,4 +1,4 @@
-"""Everybody who wanted to depart, so that no policy changes who is counted (figures.md, Everybody)."""
+"""All vehicles due to depart, so that the policy does not affect the choice (figures.md, Everybody)."""
 
 import numpy as np
 
@@ -7,24 +7,24 @@ from cosim.types import Bools, Floats, Ints, Kind, Snapshot
 
 
 class Everybody:
-    """The vehicles on the road in the counted time, a slot each, and those that wait to be inserted.
+    """The vehicles on the road in the counted time, a slot each, and vehicles waiting for insertion.
 
-    A vehicle that cannot drive on loses the time up to the horizon: a wreck that was taken off the road, and
-    all of them where a crash ends the episode (`ends`) before the counted time of `duration` s is over.
+    A vehicle that cannot continue loses the time up to the horizon: a wreck that was taken off the road, and
+    every vehicle if a crash ends the episode (`ends`) before the counted time of `duration` s.
     """
 
     def __init__(self, duration: float, ends: bool) -> None:
         self._duration, self._ends = duration, ends
         self._slots = Slots()
         self._crashed = False
-        self.wrecks: dict[str, float] = {}  # that were taken off the road -> s, when each was seen last
+        self.wrecks: dict[str, float] = {}  # wreck taken off the road -> s, time of its last frame
         self._av: Bools = np.zeros(64, np.bool_)
         self._entry: Floats = np.zeros(64)  # [slots] s
         self._rows: Ints = np.zeros(0, np.int64)
         self._newest: Snapshot | None = None
 
     def of(self, snapshot: Snapshot) -> Ints:
-        """[n] the slots of the vehicles of this frame, the newest; a frame counts once, however many ask."""
+        """[n] slots of the vehicles of this newest frame; repeated calls count the frame once."""
         if snapshot is self._newest:
             return self._rows
         vehicles, known = snapshot.vehicles, self._rows
@@ -50,17 +50,17 @@ class Everybody:
 
     @property
     def av(self) -> Bools:
-        """[slots] which are AVs."""
+        """[slots] whether the vehicle is an AV."""
         return self._av[: len(self)]
 
     @property
     def entry(self) -> Floats:
-        """[slots] s of counted time that each waited to be inserted."""
+        """[slots] s of counted time waiting for insertion."""
         return self._entry[: len(self)]
 
     @property
     def rest(self) -> Floats:
-        """[slots] s from each vehicle's last frame to the horizon, where it cannot drive on; else 0."""
+        """[slots] s from the last frame to the horizon for vehicles that cannot continue; else 0."""
         found = np.zeros(len(self))
         if self._crashed:
             found[self._rows] = self._horizon - self._now
@@ -70,8 +70,8 @@ class Everybody:
 
     @property
     def waiting(self) -> tuple[Floats, Bools]:
-        """[w] s of counted time up to the horizon that those not inserted have waited, and which of them will
-        be AVs; one of nan where they are not known."""
+        """[w] s of counted time up to the horizon of vehicles that are not inserted, and whether each will be
+        an AV; a single nan if unknown."""
         if self._newest is None or self._newest.waiting is None:
             return np.full(1, np.nan), np.zeros(1, np.bool_)
         due = self._newest.waiting.values()
@@ -86,11 +86,11 @@ class Everybody:
 
     @property
     def _horizon(self) -> float:
-        """s, up to which everybody is counted."""
+        """End of the counted time of all vehicles, s."""
         return self._begin + self._duration if self._crashed else self._now
 
     def _happen(self, snapshot: Snapshot, before: float) -> None:
-        """What happened since the frame of `before` (s)."""
+        """Process the events since the frame at `before` (s)."""
         events = snapshot.events
         for vehicle, delay in zip(events.departed, events.depart_delays, strict=False):
             if (slot := self.number(vehicle)) >= 0:

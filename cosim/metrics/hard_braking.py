@@ -1,4 +1,4 @@
-"""Hard braking: how often vehicles began to brake harder than 3 m/s2, AVs and all."""
+"""Hard braking: beginnings of braking harder than 3 m/s2, of AVs and of all vehicles."""
 
 import numpy as np
 
@@ -9,8 +9,8 @@ THRESHOLD = 3.0  # m/s2, about 0.3 g: the usual bound of hard-braking events in 
 
 
 class HardBraking:
-    """An event begins at a frame whose mean deceleration exceeds the threshold, unless one goes on; that
-    a wreck stands at once is none."""
+    """An event begins at a frame with mean deceleration above the threshold, unless another is in progress.
+    The sudden stop of a wreck is no event."""
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._time = first.time

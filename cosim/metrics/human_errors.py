@@ -1,4 +1,4 @@
-"""Errors of human drivers and persons, and the collisions in which one had a part."""
+"""Errors of human drivers and persons, and collisions that involve one."""
 
 from cosim.metrics.context import MetricContext
 from cosim.types import Metric, Snapshot

@@ -20,7 +20,7 @@ class Jerk:
         self._time = first.time
         self._sum = 0.0  # m/s3
         self._counted = 0
-        self._wrecks: set[str] = set()  # they stand at once, which is no driving
+        self._wrecks: set[str] = set()  # their sudden stop is excluded
         self.add(first)
 
     def add(self, snapshot: Snapshot) -> None:

@@ -1,4 +1,4 @@
-"""Whether two whose straight courses meet do so along their lanes too, which bend and part."""
+"""A check of straight-line conflicts along lanes, which bend and diverge."""
 
 from collections.abc import Iterable
 from itertools import product
@@ -10,52 +10,52 @@ from cosim.geometry import Boxes, boxes, first_contacts, time_to_collision
 from cosim.road import RoadMap
 from cosim.types import Floats, Snapshot
 
-LATER = 0.5  # s after the straight courses meet, within which those along the lanes must
-STEP = 0.1  # s between the poses compared
-REACH = 150.0  # m of lanes that are followed beyond the present one
-BEYOND = 400.0  # m that a way goes on straight beyond its ends
+MAX_LATER = 0.5  # s, largest delay of the contact along lanes after the straight-line contact
+TIME_STEP = 0.1  # s between compared poses
+LANE_REACH = 150.0  # m of lanes followed beyond the present one
+STRAIGHT_BEYOND = 400.0  # m of straight extension beyond both ends of a path
 
-Ways = set[tuple[frozenset[str], frozenset[str]]]  # of two vehicles, each the edges that it passes
+Ways = set[tuple[frozenset[str], frozenset[str]]]  # pairs of paths of two vehicles, as sets of edges
 
 
 class Way(NamedTuple):
-    """A lane and those that follow it."""
+    """A path: a lane and its successors."""
 
     edges: frozenset[str]
     line: Floats  # [p,3] lane position m, x m, y m
 
 
-OFF = Way(frozenset(), np.zeros((0, 3)))  # of who is off every lane
+OFF_LANE = Way(frozenset(), np.zeros((0, 3)))  # of a vehicle off every lane
 
 
 class LaneCourses:
-    """Lets vehicles follow their lanes at constant speed, at the present distance to the centre line."""
+    """Extrapolates vehicles along their lanes at constant speed and constant offset from the centre line."""
 
     def __init__(self, road: RoadMap) -> None:
         self._road = road
         self._known: dict[int, list[Way]] = {}  # by lane
 
     def meeting(self, s: Snapshot, i: int, j: int) -> Ways | None:
-        """The ways ahead of the vehicles of rows `i` and `j`, which touch if they drive straight on, by which
-        they touch along their lanes too, at most `LATER` s after that; None where they do in any case.
+        """For vehicles `i` and `j` with a straight-line contact: the pairs of paths with a contact along the
+        lanes, at most `MAX_LATER` s later; None if every pair has one.
 
-        Those on one edge, who may be changing lanes, do in any case. Who is off every lane goes straight on.
+        Vehicles on one edge may change lanes and always count. A vehicle off every lane goes straight on.
         """
         a, b = int(s.lane[i]), int(s.lane[j])
         if max(a, b) < 0 or (min(a, b) >= 0 and self._road.lanes[a].edge == self._road.lanes[b].edge):
             return None
         one, other = (boxes(s, np.array([row])) for row in (i, j))
-        within = float(time_to_collision(one, other)[0]) + LATER
-        times = np.arange(0.0, within, STEP)
+        within = float(time_to_collision(one, other)[0]) + MAX_LATER
+        times = np.arange(0.0, within, TIME_STEP)
         mine = self._courses(s, i, times)._replace(length=float(s.length[i]), width=float(s.width[i]))
-        touch = first_contacts(mine, self._courses(s, j, times), STEP) < within  # [ways of i, ways of j]
+        touch = first_contacts(mine, self._courses(s, j, times), TIME_STEP) < within  # [ways of i, ways of j]
         if touch.all():
             return None
         pairs = product(self._ways(a), self._ways(b))
         return {(p.edges, q.edges) for (p, q), met in zip(pairs, touch.ravel(), strict=True) if met}
 
     def still(self, ways: Ways, s: Snapshot, pair: Iterable[str]) -> Ways:
-        """Those `ways` that the vehicles may still take, from where they are now."""
+        """The subset of `ways` that is still possible from the present positions."""
         for k, name in enumerate(pair):
             row = s.row.get(name)
             if row is not None and (lane := int(s.lane[row])) >= 0:
@@ -63,7 +63,7 @@ class LaneCourses:
         return ways
 
     def _courses(self, s: Snapshot, row: int, times: Floats) -> Boxes:
-        """One vehicle on each of its ways: x, y, heading, speed [ways,t], length and width [ways]."""
+        """One vehicle on each of its paths: x, y, heading, speed [ways,t], length and width [ways]."""
         length, poses = float(s.length[row]), []
         if s.lane[row] < 0:
             alone = boxes(s, np.array([row]))
@@ -89,16 +89,16 @@ class LaneCourses:
 
     def _ways(self, lane: int) -> list[Way]:
         if lane < 0:
-            return [OFF]
+            return [OFF_LANE]
         if lane not in self._known:
             self._known[lane] = [self._way(lanes) for lanes in self._sequences((lane,), 0.0)]
         return self._known[lane]
 
     def _sequences(self, lanes: tuple[int, ...], driven: float) -> list[tuple[int, ...]]:
-        """All ways that begin with `lanes`, of which `driven` m lie beyond the first."""
+        """All paths that begin with `lanes`, of which `driven` m are beyond the first lane."""
         road = self._road.lanes
         following = [k for k in road[lanes[-1]].successors if k not in lanes]
-        if driven > REACH or not following:
+        if driven > LANE_REACH or not following:
             return [lanes]
         return [way for k in following for way in self._sequences((*lanes, k), driven + road[k].length)]
 
@@ -114,5 +114,5 @@ class LaneCourses:
         ends = [line[0], line[-1]]
         if len(line) > 1:
             first, last = ((step / step[0]) for step in (line[1] - line[0], line[-1] - line[-2]))
-            ends = [line[0] - BEYOND * first, line[-1] + BEYOND * last]
+            ends = [line[0] - STRAIGHT_BEYOND * first, line[-1] + STRAIGHT_BEYOND * last]
         return Way(frozenset(self._road.lanes[k].edge for k in lanes), np.vstack([ends[0], line, ends[1]]))

@@ -6,34 +6,34 @@ from cosim.metrics.context import AV, MetricContext
 from cosim.road import Crossing, Link, RoadMap, Rule
 from cosim.types import Entry, Metric, Offence, Snapshot
 
-COMFORTABLE = 3.0  # m/s2: who could stop at yellow with this must
-STOPPED = 0.5  # m/s, at most, within the last 10 m before a stop sign
-HARD = 3.0 + 1e-3  # m/s2 (who brakes with just 3 brakes comfortably): nobody with the right of way is made to
+COMFORT_DECEL = 3.0  # m/s2: yellow must be obeyed if this deceleration suffices
+STOPPED_SPEED = 0.5  # m/s, maximum within the last 10 m before a stop sign
+HARD_DECEL = 3.0 + 1e-3  # m/s2, above the comfortable 3.0: forbidden to cause for vehicles with priority
 LEADER = (
     30.0,
     10.0,
-)  # m: a vehicle that near ahead, or so near beyond where `COMFORTABLE` stops it, is braked for
-WALKERS = 10.0  # m from a crossing: persons that near are braked for
+)  # m ahead, or beyond the stopping point with `COMFORT_DECEL`: a leader there excuses braking
+PERSON_REACH = 10.0  # m from a crossing: a person there excuses braking
 SIGNS = (Rule.STOP, Rule.ALL_WAY_STOP)
-BY_TURNS = (Rule.EQUAL, Rule.ALL_WAY_STOP, Rule.ZIPPER)  # all wait for one another: only collisions count
-GOES = frozenset(map(ord, "GgoO"))  # states of a signal that lets go, or is off
+MUTUAL_RULES = (Rule.EQUAL, Rule.ALL_WAY_STOP, Rule.ZIPPER)  # equal rank: only collisions count
+OPEN_STATES = frozenset(map(ord, "GgoO"))  # states of a green or switched-off signal
 
 
 def ran_red(entry: Entry) -> bool:
-    """Whether it entered on red, or on yellow although it could have stopped comfortably."""
+    """Whether the AV entered on red, or on yellow although a comfortable stop was possible."""
     if entry.state in ("y", "Y"):
-        return entry.yellow_speed**2 / (2.0 * COMFORTABLE) <= entry.yellow_distance
+        return entry.yellow_speed**2 / (2.0 * COMFORT_DECEL) <= entry.yellow_distance
     return entry.state in ("r", "u")
 
 
 def ran_stop(entry: Entry, link: Link) -> bool:
-    """Whether it did not stop where a sign, or a signal's arrow, asks for a stop."""
+    """Whether the AV did not stop at a stop sign or a green arrow."""
     asked = entry.state == "s" or (link.signal < 0 and link.rule in SIGNS)
-    return asked and entry.least_speed > STOPPED
+    return asked and entry.least_speed > STOPPED_SPEED
 
 
 class AvCounts:
-    """Counts of what AVs do: NA while no AV has been seen. `offences`: what replays tell of them."""
+    """Base of counts over AVs: NA until an AV appears. `offences`: for replays."""
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._avs = bool((first.kind == AV).any())
@@ -47,7 +47,7 @@ class AvCounts:
 
 
 class StopLines(AvCounts):
-    """Entries of AVs that broke the law; those against the right of way are judged by what follows."""
+    """Unlawful entries of AVs; failures to yield are judged by the foes' reaction."""
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         super().reset(first, context)
@@ -63,7 +63,7 @@ class StopLines(AvCounts):
             self._open = [entry for entry in self._open if self._goes_on(entry, snapshot)]
         self._before, self._last = self._last, snapshot
         for entry in snapshot.events.entries:
-            if entry.inside:  # where it waited, or might have, nobody had to brake for it
+            if entry.inside:  # an entry from the internal waiting position follows a counted entry
                 self._open = [e for e in self._open if e.vehicle != entry.vehicle]
             elif ran_red(entry):
                 self._red += 1
@@ -83,9 +83,9 @@ class StopLines(AvCounts):
         }
 
     def _goes_on(self, entry: Entry, now: Snapshot) -> bool:
-        """Whether the entry is still to be followed; counts it when a foe has begun to brake hard for it."""
+        """Whether to keep following the entry; counts it when a foe begins to brake hard for the AV."""
         waits = not entry.inside and self._road.waits_inside(self._links[entry.link].via)
-        if self._links[entry.link].rule not in BY_TURNS and not waits:
+        if self._links[entry.link].rule not in MUTUAL_RULES and not waits:
             for foe, link in entry.foes:
                 if self._made_to_brake(foe, link, entry.vehicle, now):
                     self._way += 1
@@ -94,7 +94,7 @@ class StopLines(AvCounts):
         return self._undecided(entry, now)
 
     def _undecided(self, entry: Entry, now: Snapshot) -> bool:
-        """Whether the AV is still in the junction and has touched nobody; counts it when it has."""
+        """Whether the AV is still in the junction without a collision; counts a collision with a foe."""
         foes = {foe for foe, _ in entry.foes}
         for c in now.events.collisions:
             pair = {c.collider, c.victim}
@@ -110,10 +110,10 @@ class StopLines(AvCounts):
 
     def _made_to_brake(self, foe: str, link: int, av: str, now: Snapshot) -> bool:
         rows = [frame.row.get(foe) for frame in (self._before, self._last, now)]
-        if rows[1] is None or rows[2] is None or _braking(self._last, rows[1], now, rows[2]) <= HARD:
+        if rows[1] is None or rows[2] is None or _braking(self._last, rows[1], now, rows[2]) <= HARD_DECEL:
             return False
-        if rows[0] is not None and _braking(self._before, rows[0], self._last, rows[1]) > HARD:
-            return False  # it braked so hard already
+        if rows[0] is not None and _braking(self._before, rows[0], self._last, rows[1]) > HARD_DECEL:
+            return False  # the foe braked equally hard before
         return not self._ways.excused(link, now, rows[2], now.row.get(av, -1))
 
 
@@ -130,7 +130,7 @@ def persons_near(now: Snapshot, crossing: Crossing, reach: float) -> bool:
 
 
 class Ways:
-    """Where vehicles are on the way of a link: before its line, on its internal lanes, beyond it."""
+    """Positions on the path of a link: before its line, on its internal lanes, beyond it."""
 
     def __init__(self, road: RoadMap) -> None:
         self._road = road
@@ -141,7 +141,7 @@ class Ways:
                 self._over.setdefault(lane, []).append(crossing)
 
     def left(self, link: int, now: Snapshot, row: int) -> bool:
-        """Whether a vehicle that entered by the link is out of the junction, its rear bumper too."""
+        """Whether a vehicle that entered by the link has left the junction completely."""
         lane, lanes = int(now.lane[row]), self._road.lanes
         if lane < 0 or lanes[lane].internal:
             return lane not in self._road.inside[link]
@@ -149,7 +149,7 @@ class Ways:
         return beyond or bool(now.lane_position[row] >= now.length[row])
 
     def excused(self, link: int, now: Snapshot, row: int, av: int) -> bool:
-        """Whether a vehicle on the way of `link` has another reason to brake than the one in row `av`."""
+        """Whether a vehicle on the path of `link` has another reason to brake than the AV in row `av`."""
         lane, inside, target = int(now.lane[row]), self._road.inside[link], self._road.links[link].target
         if lane in inside:
             ahead = (*inside[inside.index(lane) :], target)
@@ -157,19 +157,19 @@ class Ways:
             return True  # off every lane, or past the junction
         else:
             signal = self._road.links[link].signal
-            if 0 <= signal < len(now.signals) and int(now.signals[signal]) not in GOES:
+            if 0 <= signal < len(now.signals) and int(now.signals[signal]) not in OPEN_STATES:
                 return True
             if signal < 0 and self._road.links[link].rule in SIGNS:
                 return True
             ahead = (lane, *inside, target) if lane == self._road.links[link].origin else (lane,)
         near, more = LEADER
-        near = max(near, float(now.speed[row]) ** 2 / (2.0 * COMFORTABLE) + more)
+        near = max(near, float(now.speed[row]) ** 2 / (2.0 * COMFORT_DECEL) + more)
         start = -float(now.lane_position[row])  # m from its front bumper to the start of the lane
         rest = start + self._road.lanes[lane].length
         comes = lane in inside or (lane == self._road.links[link].origin and rest <= near)
-        if comes and any(persons_near(now, crossing, WALKERS) for crossing in self.crossings(link)):
+        if comes and any(persons_near(now, crossing, PERSON_REACH) for crossing in self.crossings(link)):
             return True
-        stretches = []  # lane, m to its start, whether only who is not wholly on it is in the way
+        stretches = []  # lane, m to its start, whether only vehicles partly on it obstruct
         for k in ahead:
             stretches.append((k, start, False))
             start += self._road.lanes[k].length

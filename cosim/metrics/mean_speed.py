@@ -1,11 +1,11 @@
-"""Mean speed: the distance that all vehicles drove over the time that they were on the road."""
+"""Mean speed: total distance over total time of all vehicles on the road."""
 
 from cosim.metrics.context import MetricContext
 from cosim.types import Metric, Snapshot
 
 
 class MeanSpeed:
-    """Whoever waits to be inserted is not in it: that is in the total delay."""
+    """Waiting for insertion is excluded; the total delay includes it."""
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._time = first.time

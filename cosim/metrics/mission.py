@@ -1,17 +1,16 @@
-"""Mission: did the vehicle that needs the help of others get where it wanted, and when."""
+"""Mission: success and time of the mission vehicle."""
 
 from cosim.metrics.context import MetricContext
 from cosim.types import Metric, Snapshot
 
-STANDING = 0.1  # m/s, SUMO's own threshold of a halting vehicle
+STANDSTILL_SPEED = 0.1  # m/s, SUMO's own threshold of a halting vehicle
 
 
 class MissionSuccess:
-    """Success is being on a goal lane without a collision before it (figures.md, Mission and distance).
+    """Success is reaching a goal lane without an earlier collision (figures.md, Mission and distance).
 
-    With several mission vehicles all of them have to succeed, and the time is that of the last. NA without
-    a mission, without a goal, or while no mission vehicle has been seen; without a goal of its own (`auto`),
-    until one has been on a lane that ends or gives way.
+    All mission vehicles must succeed; the time is that of the last. NA without a mission or goal, or before a
+    mission vehicle appears; with mission `auto`, until one has been on a lane that ends or gives way.
     """
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
@@ -27,7 +26,7 @@ class MissionSuccess:
     def add(self, snapshot: Snapshot) -> None:
         if not self._applies:
             return
-        for collision in snapshot.events.collisions:  # they came before this frame's positions
+        for collision in snapshot.events.collisions:  # they precede this frame's positions
             self._crashed.update((collision.collider, collision.victim))
         self._standing.difference_update(snapshot.events.arrived)
         for row in snapshot.mission.nonzero()[0].tolist():
@@ -36,7 +35,7 @@ class MissionSuccess:
                 continue
             if self._reached.setdefault(name, None) is not None:
                 continue
-            if snapshot.speed[row] <= STANDING:
+            if snapshot.speed[row] <= STANDSTILL_SPEED:
                 self._standing.add(name)
             else:
                 self._standing.discard(name)
@@ -44,7 +43,7 @@ class MissionSuccess:
                 self._reached[name] = snapshot.time - self._begin
 
     def _struggles(self, lane: int) -> bool:
-        """Whether it ends or gives way (off every lane, -1, nobody is asked to)."""
+        """Whether the lane ends or gives way (False for -1, off every lane)."""
         return lane >= 0 and lane not in self._goal and not self._lanes[lane].internal
 
     def result(self) -> dict[str, Metric]:
@@ -53,7 +52,7 @@ class MissionSuccess:
             times = [time for time in self._reached.values() if time is not None]
             success = len(times) == len(self._reached)
             when = max(times) if success else None
-            # it stands without having succeeded, typically at the end of its lane
+            # standing without success, typically at the end of its lane
             failed = any(self._reached[name] is None for name in self._standing)
         return {
             "mission_success": Metric(success, "bool", "higher"),

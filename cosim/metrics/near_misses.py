@@ -1,4 +1,4 @@
-"""Near-misses: encounters of two that came grave by one measure, and the vehicle time they are counted in."""
+"""Near-misses: critical encounters of pairs by one measure, and the vehicle time for their rates."""
 
 from dataclasses import dataclass, field
 
@@ -6,12 +6,12 @@ from cosim.metrics.context import AV, PERSON, MetricContext
 from cosim.metrics.lane_courses import LaneCourses, Ways
 from cosim.types import Ints, Metric, Snapshot
 
-APART = 1.0  # s without a grave frame: what follows is another encounter
-SETTLED = 2.0  # s after which a way that is still open counts as taken
+MIN_PAUSE = 1.0  # s without a grave frame: what follows is another encounter
+SETTLED_AFTER = 2.0  # s after which a way that is still open counts as taken
 
 
 @dataclass(slots=True)
-class Meeting:
+class Encounter:
     """One encounter."""
 
     pair: tuple[str, str]
@@ -28,8 +28,8 @@ class NearMisses:
         """`courses`: of a measure that lets both drive straight on."""
         self._measure = measure  # ttc, drac, pet
         self._courses = courses
-        self._met: list[Meeting] = []
-        self._now: dict[tuple[str, str], Meeting] = {}  # the newest one of each pair
+        self._met: list[Encounter] = []
+        self._now: dict[tuple[str, str], Encounter] = {}  # the newest one of each pair
         self._open: dict[tuple[str, str], None] = {}  # those of which may have some that count on some ways
         self._vehicles = self._avs = False  # whether any has been seen
 
@@ -46,8 +46,8 @@ class NearMisses:
             if kinds == {PERSON} or (ways is not None and not ways):
                 continue
             pair = s.ids[i], s.ids[j]
-            if pair not in self._now or s.time - self._now[pair].last > APART + 1e-9:
-                self._now[pair] = Meeting(pair, s.time, AV in kinds)
+            if pair not in self._now or s.time - self._now[pair].last > MIN_PAUSE + 1e-9:
+                self._now[pair] = Encounter(pair, s.time, AV in kinds)
                 self._met.append(self._now[pair])
             meeting = self._now[pair]
             meeting.last, meeting.counts = s.time, meeting.counts or ways is None
@@ -63,14 +63,14 @@ class NearMisses:
             meeting = self._now[pair]
             left = [(time, self._courses.still(ways, s, pair)) for time, ways in meeting.open]
             meeting.open = [(time, ways) for time, ways in left if ways]
-            meeting.counts |= any(s.time - time > SETTLED for time, _ in meeting.open)
+            meeting.counts |= any(s.time - time > SETTLED_AFTER for time, _ in meeting.open)
             if meeting.counts:
                 meeting.open.clear()
             if not meeting.open:
                 del self._open[pair]
 
     @property
-    def counted(self) -> list[Meeting]:
+    def counted(self) -> list[Encounter]:
         """The near-misses so far, in the order they began."""
         return [meeting for meeting in self._met if meeting.counts or meeting.open]
 
@@ -79,8 +79,8 @@ class NearMisses:
         with_av = sum(meeting.with_av for meeting in found)
         counts = {"": (len(found), self._vehicles), "av_": (with_av, self._avs)}
         return {
-            f"{who}near_misses_{self._measure}": Metric(count if seen else None, "encounters", "lower")
-            for who, (count, seen) in counts.items()
+            f"{prefix}near_misses_{self._measure}": Metric(count if seen else None, "encounters", "lower")
+            for prefix, (count, seen) in counts.items()
         }
 
 

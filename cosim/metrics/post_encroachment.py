@@ -1,5 +1,5 @@
-"""Post-encroachment time: the shortest time between an AV's (or mission vehicle's) and another's passage;
-how often anybody's was short."""
+"""Post-encroachment time: the smallest time between an AV's (or mission vehicle's) and another's passage;
+and the near-misses of all vehicles by PET."""
 
 import numpy as np
 
@@ -9,8 +9,8 @@ from cosim.metrics.near_misses import NearMisses
 from cosim.metrics.slots import Slots, grown
 from cosim.types import Ints, Metric, Snapshot
 
-LONGEST = 5.0  # s, a later passage is no encounter any more (Allen et al. 1978 look at 1 to 5 s)
-ENCROACHED = 1.0  # s, a shorter one is a near-miss
+MAX_PET = 5.0  # s, limit of an encounter (Allen et al. 1978 use 1 to 5 s)
+NEAR_MISS_PET = 1.0  # s
 
 
 class PostEncroachment:
@@ -21,7 +21,7 @@ class PostEncroachment:
         self._contact = context.road.contact
         self._guessed = context.mission_guessed
         self._slots = Slots()
-        self._frames = int(np.ceil(LONGEST / self._interval)) + 1
+        self._frames = int(np.ceil(MAX_PET / self._interval)) + 1
         self._trail = np.full((self._frames, 64, 6), np.nan)  # x m, y m, cos, sin, m/s, road
         self._lanes = np.full((self._frames, 64), -1)  # [frames,slots] as in `Snapshot.lane`
         self._sizes = np.zeros((64, 2))  # [slots,2] m
@@ -50,15 +50,15 @@ class PostEncroachment:
         self._watched[slot] |= watched(s, self._guessed)
         vehicles = len(self._slots), self._sizes, self._watched
         ring = self._trail, self._newest, *vehicles, self._interval, self._contact.table
-        smallest, pairs = encroachment(*ring, ENCROACHED)
+        smallest, pairs = encroachment(*ring, NEAR_MISS_PET)
         self._smallest = min(self._smallest, smallest)
         self._lanes[self._newest] = -1
         self._lanes[self._newest, slot] = s.lane
         self.near_misses.add(s, self._met(s, slot, pairs))
 
     def _met(self, s: Snapshot, slot: Ints, pairs: Ints) -> Ints:
-        """[q,2] rows of those `pairs` [p,2] of places who are both on the road and have not been on one lane
-        in all of the trail: those follow one another, or part, in a bend."""
+        """[q,2] rows of the `pairs` [p,2] of slots with both on the road and never on one lane in the whole
+        trail. Pairs on one lane follow each other, or diverge, in a bend."""
         row = np.full(len(self._slots), -1)
         row[slot] = np.arange(s.n)
         kept = [
@@ -69,7 +69,7 @@ class PostEncroachment:
         return row[np.array(kept, np.int64).reshape(-1, 2)]
 
     def _drop_absent(self) -> None:
-        """In an hour thousands of vehicles come and go, and a frame's cost grows with all that have slots."""
+        """Free the slots of absent vehicles: a frame's cost grows with the number of slots."""
         kept = np.flatnonzero(~np.isnan(self._trail[:, : len(self._slots), 0]).all(0))
         self._slots.keep(kept)
         self._trail, self._lanes = self._trail[:, kept], self._lanes[:, kept]
@@ -77,5 +77,5 @@ class PostEncroachment:
         self._known = None
 
     def result(self) -> dict[str, Metric]:
-        value = float(self._smallest) if self._smallest <= LONGEST else None
+        value = float(self._smallest) if self._smallest <= MAX_PET else None
         return {"min_pet_s": Metric(value, "s", "higher"), **self.near_misses.result()}

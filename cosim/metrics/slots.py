@@ -1,4 +1,4 @@
-"""Tables of vehicles over time: a lasting number for each, and arrays that grow with them."""
+"""Tables of vehicles over time: a persistent number for each, and growing arrays."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,7 +10,7 @@ from cosim.types import Ints
 
 
 class Slots:
-    """Gives every vehicle of an episode a lasting number, in order of appearance (until `keep`)."""
+    """Assigns every vehicle of an episode a persistent number, in order of appearance (until `keep`)."""
 
     def __init__(self) -> None:
         self.of: dict[str, int] = {}

@@ -1,4 +1,4 @@
-"""Speeding: how often and how far AVs were above the limit of the lane they drove on."""
+"""Speeding: share of time and largest excess of AVs above their lane's limit."""
 
 import numpy as np
 import numpy.typing as npt
@@ -8,7 +8,7 @@ from cosim.metrics.context import AV, MetricContext
 from cosim.road.lane import NO_LIMIT
 from cosim.types import Floats, Metric, Snapshot
 
-TOLERATED = 0.5  # m/s
+TOLERANCE = 0.5  # m/s
 
 
 class Speeding:
@@ -43,13 +43,13 @@ class Speeding:
 def _excess(
     kind: npt.NDArray[np.int8], speed: Floats, lane: npt.NDArray[np.int32], limits: Floats
 ) -> tuple[int, int, float]:
-    """AVs on a lane, those of them above its limit by more than is tolerated, the largest excess (m/s)."""
+    """Number of AVs on a lane, number of those speeding, largest excess (m/s)."""
     frames, above, worst = 0, 0, 0.0
     for k in range(len(kind)):
         if kind[k] != AV or lane[k] < 0:
             continue
         frames += 1
         excess = speed[k] - limits[lane[k]]
-        above += excess > TOLERATED
+        above += excess > TOLERANCE
         worst = max(worst, excess)
     return frames, above, worst

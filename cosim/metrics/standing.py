@@ -1,4 +1,4 @@
-"""Standing AVs: junctions that they block, and AVs that stand for long without a reason."""
+"""Standing AVs: blocked junctions, and AVs that stand for long without a reason."""
 
 from collections.abc import Sequence
 
@@ -10,12 +10,12 @@ from cosim.metrics.law import AvCounts, Ways, persons_near
 from cosim.road import Crossing
 from cosim.types import Metric, Offence, Snapshot
 
-STANDING = 0.1  # m/s, SUMO's own threshold of a halting vehicle
-BLOCKS = 5.0  # s inside a junction
-STUCK = 60.0  # s
-QUEUE = 10.0  # m, gap to the vehicle ahead in a queue
-BRAKES = -0.1  # m/s2
-WAIT = frozenset(map(ord, "ruyY"))  # states of a signal that asks to wait
+STANDSTILL = 0.1  # m/s, SUMO's own threshold of a halting vehicle
+BLOCKED_AFTER = 5.0  # s inside a junction
+STUCK_AFTER = 60.0  # s
+QUEUE_GAP = 10.0  # m, gap to the vehicle ahead in a queue
+BRAKING = -0.1  # m/s2
+CLOSED = frozenset(map(ord, "ruyY"))  # red and yellow states of a signal
 
 
 class Standing(AvCounts):
@@ -44,8 +44,8 @@ class Standing(AvCounts):
         super().add(snapshot)
         s = snapshot
         self._wrecks.update(s.events.wrecked)
-        any_stands = slow(s.kind, s.speed, AV, STANDING)
-        standing = np.flatnonzero((s.kind == AV) & (s.speed < STANDING)).tolist() if any_stands else ()
+        any_stands = slow(s.kind, s.speed, AV, STANDSTILL)
+        standing = np.flatnonzero((s.kind == AV) & (s.speed < STANDSTILL)).tolist() if any_stands else ()
         inside, waiting = self._inside, self._waiting
         self._inside, self._waiting = {}, {}
         reasons = self._reasons(s, standing) if standing else frozenset()
@@ -53,14 +53,14 @@ class Standing(AvCounts):
             if (name := s.ids[row]) in self._wrecks:
                 continue
             self._waiting[name] = since = s.time if row in reasons else waiting.get(name, s.time)
-            if s.time - since > STUCK and name not in self._stuck:
+            if s.time - since > STUCK_AFTER and name not in self._stuck:
                 self._stuck.add(name)
-                self.offences.append(Offence(s.time, name, f"stood for {STUCK:.0f} s without a reason"))
+                self.offences.append(Offence(s.time, name, f"stood for {STUCK_AFTER:.0f} s without a reason"))
             if junction := self._blocks(int(s.lane[row])):
                 before = inside.get(name)
                 here = before if before and before[0] == junction else (junction, s.time)
                 self._inside[name] = here
-                if s.time - here[1] > BLOCKS and (name, *here) not in self._blocked:
+                if s.time - here[1] > BLOCKED_AFTER and (name, *here) not in self._blocked:
                     self._blocked.add((name, *here))
                     self.offences.append(Offence(s.time, name, f"blocked junction {junction}"))
 
@@ -71,16 +71,16 @@ class Standing(AvCounts):
         }
 
     def _blocks(self, number: int) -> str:
-        """The junction in which a vehicle on this lane stands in others' way, "" for none."""
+        """The junction blocked by a vehicle that stands on this lane, "" for none."""
         if number < 0 or not self._road.lanes[number].internal or self._road.waits_inside(number):
             return ""
         return self._road.lanes[number].start
 
     def _reasons(self, s: Snapshot, standing: Sequence[int]) -> frozenset[int]:
-        """The rows among `standing` that have a reason to stand: they, or the head of their queue, who needs
-        none unless it is an AV."""
-        queued = np.flatnonzero((s.speed < STANDING) | (s.accel < BRAKES))
-        _, leaders = gap_ahead(s, self._road.straight_on, queued, QUEUE)
+        """The rows among `standing` with a reason to stand, of their own or of the head of their queue; a
+        human head of a queue needs no reason."""
+        queued = np.flatnonzero((s.speed < STANDSTILL) | (s.accel < BRAKING))
+        _, leaders = gap_ahead(s, self._road.straight_on, queued, QUEUE_GAP)
         ahead = dict(
             zip(queued.tolist(), leaders.tolist(), strict=True)
         )  # row -> row of the next, -1 for none
@@ -103,9 +103,9 @@ class Standing(AvCounts):
         return frozenset(row for row in standing if found[row])
 
     def _at_signal(self, s: Snapshot, lane: int) -> bool:
-        """Whether a signal at the end of the lane asks to wait."""
-        return any(k < len(s.signals) and int(s.signals[k]) in WAIT for k in self._signals.get(lane, ()))
+        """Whether a signal at the end of the lane is red or yellow."""
+        return any(k < len(s.signals) and int(s.signals[k]) in CLOSED for k in self._signals.get(lane, ()))
 
     def _for_persons(self, s: Snapshot, lane: int) -> bool:
-        """Whether a person is on a crossing over the lane's ways through the junction."""
+        """Whether a person is on a crossing over the lane's paths through the junction."""
         return any(persons_near(s, one, 0.5 * one.width) for one in self._crossings.get(lane, ()))

@@ -1,5 +1,5 @@
-"""Time to collision of AVs and mission vehicles with others: the smallest, and how long it was critical; how
-often anybody's was."""
+"""Time to collision of AVs and mission vehicles with others: smallest value and critical share; and the
+near-misses of all vehicles by TTC."""
 
 from cosim.metrics.context import CRITICAL, HORIZON, MetricContext
 from cosim.metrics.near_misses import NearMisses

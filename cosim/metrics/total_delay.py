@@ -1,4 +1,4 @@
-"""Total delay: the time lost by everybody who wanted to depart, on the road and before it."""
+"""Total delay: the time lost by all vehicles due to depart, on the road and before insertion."""
 
 import numpy as np
 
@@ -6,11 +6,11 @@ from cosim.metrics.context import MetricContext
 from cosim.metrics.slots import grown
 from cosim.types import Floats, Metric, Snapshot
 
-SLOWEST = 10  # one of so many vehicles, rounded up, is among the slowest
+SLOWEST_FRACTION = 10  # one in 10 vehicles, rounded up
 
 
 class TotalDelay:
-    """SUMO's time loss and waiting to be inserted, within the counted time; NA where either is unknown."""
+    """SUMO's time loss plus waiting for insertion, within the counted time; NA if either is unknown."""
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._everybody = context.everybody
@@ -29,7 +29,7 @@ class TotalDelay:
         lost[: len(self._before)] -= self._before
         waited, to_come = everybody.waiting
         delay, av = np.concatenate([lost, waited]), np.concatenate([everybody.av, to_come])
-        slowest = np.sort(delay)[::-1][: -(-len(delay) // SLOWEST)]
+        slowest = np.sort(delay)[::-1][: -(-len(delay) // SLOWEST_FRACTION)]
         due = None if np.isnan(waited).any() else len(delay)
         known = not np.isnan(delay).any()
         return {

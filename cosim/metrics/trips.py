@@ -1,4 +1,4 @@
-"""What became of the AVs: trips driven to their end, and corrections by the car itself."""
+"""Completed trips of AVs, and interventions of the car controller."""
 
 from cosim.metrics.context import MetricContext
 from cosim.metrics.law import AvCounts
@@ -28,7 +28,7 @@ class Trips(AvCounts):
 
 
 class Interventions(AvCounts):
-    """How often the car began to drive otherwise than its agent commanded (`Events.interventions`)."""
+    """Number of times the car began to override its agent (`Events.interventions`)."""
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         super().reset(first, context)

@@ -1,4 +1,4 @@
-"""Waits: how long vehicles stand, where a second counts the more the longer one has waited already."""
+"""Waits: longest and squared waiting times of vehicles; squares weight long waits more."""
 
 import numpy as np
 
@@ -7,16 +7,16 @@ from cosim.metrics.context import MetricContext
 from cosim.metrics.slots import grown
 from cosim.types import Bools, Floats, Ints, Metric, Snapshot
 
-SLOW = 1.0  # m/s: a slower vehicle waits
-FORGETS = 2.0  # s of a wait that a second of driving takes away
+WAITING_SPEED = 1.0  # m/s: a slower vehicle is waiting
+FORGIVEN_PER_S = 2.0  # s of a wait removed per second of driving
 
 
 class Waits:
-    """Of everybody who wanted to depart, waiting to be inserted included (figures.md, Everybody)."""
+    """Of all vehicles due to depart, including waits for insertion (figures.md, Everybody)."""
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
         self._everybody = context.everybody
-        # [slots,2] s that each has waited now; s2, the sum of its squared waits
+        # [slots,2] s, present wait; s2, sum of squared waits
         self._tally: Floats = np.zeros((64, 2))
         self._time, self._longest = first.time, 0.0
         self._everybody.of(first)
@@ -29,7 +29,7 @@ class Waits:
         for vehicle in snapshot.events.departed:
             if (slot := everybody.number(vehicle)) >= 0:
                 self._tally[slot] = everybody.entry[slot], everybody.entry[slot] ** 2
-        planned = np.zeros(s.n, np.bool_)  # at a stop of its plan
+        planned = np.zeros(s.n, np.bool_)  # at a scheduled stop
         for vehicle in snapshot.events.stopped:
             if (row := s.row.get(vehicle)) is not None:
                 planned[row] = True
@@ -50,14 +50,14 @@ class Waits:
 
 @compiled
 def _wait(speed: Floats, planned: Bools, slots: Ints, tally: Floats, elapsed: float) -> float:
-    """Let every vehicle wait or drive for `elapsed` s; the longest wait that there is now (s)."""
+    """Update every vehicle's wait by `elapsed` s; returns the longest present wait (s)."""
     longest = 0.0
     for k in range(len(slots)):
         row = tally[slots[k]]
-        if speed[k] < SLOW and not planned[k]:
+        if speed[k] < WAITING_SPEED and not planned[k]:
             row[1] += elapsed * (2.0 * row[0] + elapsed)
             row[0] += elapsed
             longest = max(longest, row[0])
         else:
-            row[0] = max(row[0] - FORGETS * elapsed, 0.0)
+            row[0] = max(row[0] - FORGIVEN_PER_S * elapsed, 0.0)
     return longest

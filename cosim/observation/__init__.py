@@ -1,1 +1,1 @@
-"""What an AV observes: VelocityMaps, kinematic matrices, histories, and the view of an external agent."""
+"""Observations of an AV: VelocityMaps, kinematic matrices, histories, and the view of an external agent."""

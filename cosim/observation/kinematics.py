@@ -1,4 +1,4 @@
-"""The kinematic matrix: who gets a row, and the rows of every past frame in one fixed ego frame."""
+"""The kinematic matrix: the choice of rows, and the rows of every past frame in one fixed ego frame."""
 
 import numpy as np
 import numpy.typing as npt
@@ -10,13 +10,13 @@ from cosim.types import HEADING, SPEED, Bools, Floats, Floats32, Ints, Snapshot,
 
 
 def perceived(snapshot: Snapshot, egos: Ints, reach: float, share: bool) -> Bools:
-    """Which vehicles each AV perceives: [B,n].
+    """The vehicles perceived by each AV: [B,n].
 
     Args:
         snapshot: the n vehicles on the road.
         egos: [B] rows of the AVs.
-        reach: m, of one AV's own sensors, measured between centres.
-        share: whether AVs pass on what they perceive (V2V): then all perceive the same.
+        reach: m, range of an AV's own sensors, between centres.
+        share: whether AVs share their perception (V2V): then all perceive the same vehicles.
     """
     x, y = snapshot.x, snapshot.y
     near = (x - x[egos, None]) ** 2 + (y - y[egos, None]) ** 2 <= reach * reach
@@ -30,12 +30,12 @@ def choose_rows(
     egos: npt.NDArray[np.int64],  # [B]
     seen: Bools,  # [B,n]
     row_range: float,  # m
-    first: Bools,  # [B,n] which vehicles get a row before all others
+    first: Bools,  # [B,n] vehicles that get a row before all others
     rows: npt.NDArray[np.int64],  # [B,R] out: vehicle of each row, -1 for none; row 0 the ego
 ) -> bool:
-    """The ego and the perceived vehicles within `row_range`, by distance; whether a vehicle found no row."""
+    """The ego and the perceived vehicles within `row_range`, by distance; whether a vehicle got no row."""
     n, wanted = x.shape[0], rows.shape[1]
-    rank = np.empty(wanted, np.float64)  # squared distance, less a lot for those who come first
+    rank = np.empty(wanted, np.float64)  # squared distance, minus a large offset for `first`
     full = False
     for b in range(egos.shape[0]):
         e = egos[b]
@@ -61,7 +61,7 @@ def choose_rows(
             rank[k] = d2
             rows[b, k] = j
             count = min(count + 1, wanted)
-        for k in range(2, count):  # those who came first take their places by distance
+        for k in range(2, count):  # vehicles of `first` are sorted by distance too
             j, d2 = rows[b, k], rank[k] + (1e9 if first[b, rows[b, k]] else 0.0)
             i = k
             while i > 1 and rank[i - 1] + (1e9 if first[b, rows[b, i - 1]] else 0.0) > d2:
@@ -74,13 +74,13 @@ def choose_rows(
 
 
 def never_left_out(snapshot: Snapshot, graph: LaneGraph, egos: Ints, reach: float) -> Bools:
-    """The vehicles that always get a row: mission vehicles, and each ego's leader and follower.
+    """The vehicles with a guaranteed row: mission vehicles, and each ego's leader and follower.
 
     Args:
         snapshot: the n vehicles.
-        graph: which lane follows which (`RoadMap.straight_on`).
+        graph: successor lanes (`RoadMap.straight_on`).
         egos: [B] rows of the AVs.
-        reach: m, how far ahead and behind along the lanes.
+        reach: m, search range ahead and behind along the lanes.
 
     Returns:
         [B,n] whether vehicle n is one of ego B's.

@@ -1,4 +1,4 @@
-"""Turns snapshots into one History per AV: the first step of every decision."""
+"""The observer: turns snapshots into one History per AV, the first step of every decision."""
 
 from collections.abc import Callable, Mapping
 
@@ -37,9 +37,9 @@ class Observer:
         self.reset()
 
     def reset(self) -> None:
-        """Clear the past: a new episode begins."""
+        """Clear the past for a new episode."""
         self._past = KinematicPast(self._config.frames)
-        self._pasts: dict[str, KinematicPast] = {}  # AV -> the past as it knew it
+        self._pasts: dict[str, KinematicPast] = {}  # AV -> the past from its percepts
         if self._maps is not None:
             self._maps.clear()
         self._newest: Snapshot | None = None
@@ -105,7 +105,7 @@ class Observer:
         route: RouteOf,
         commanded: CommandOf,
     ) -> dict[str, History]:
-        """Of the AVs `egos`, who know the world `s` as far as they have `seen` it."""
+        """Histories of the AVs `egos`, from the vehicles of `s` that they have `seen`."""
         c, count = self._config, len(egos)
         rows = np.empty((count, c.rows), np.int64)
         none = np.zeros((count, s.n), np.bool_)
@@ -125,7 +125,7 @@ class Observer:
         now = self._moment(s, seen[0])
         for b, e in enumerate(egos):
             name = s.ids[e]
-            if lanes[b, 0] < 0:  # off every lane: it cannot be commanded now
+            if lanes[b, 0] < 0:  # off every lane: no command is possible
                 continue
             target, change = commanded(name)
             place, length = float(positions[b, 0]), float(s.length[e])
@@ -154,15 +154,15 @@ class Observer:
         return result
 
     def _perceived(self) -> Bools:
-        """[B,n] which vehicles each AV perceives in the newest frame."""
+        """[B,n] vehicles that each AV perceives in the newest frame."""
         assert self._newest is not None
         c = self._config
         return perceived(self._newest, self._egos, c.perception_range, c.share_perception)
 
     def _moment(self, s: Snapshot, seen: Bools) -> Moment:
-        """The signals, the limits that have changed, and the persons among the `seen` [n] (with V2V: whom all
-        AVs perceive)."""
-        who = np.flatnonzero((s.kind == int(Kind.PERSON)) & seen)
-        persons = np.stack([s.x, s.y, s.heading, s.speed], axis=1)[who] if len(who) else None
+        """The signals, the changed limits, and the persons among the `seen` [n] (with V2V: perceived by any
+        AV)."""
+        chosen = np.flatnonzero((s.kind == int(Kind.PERSON)) & seen)
+        persons = np.stack([s.x, s.y, s.heading, s.speed], axis=1)[chosen] if len(chosen) else None
         told = self._config.signal_timing and len(s.switches)
         return Moment(s.signals, s.switches if told else None, persons, s.limits)

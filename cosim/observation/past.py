@@ -7,17 +7,17 @@ import numpy.typing as npt
 
 from cosim.types import Bytes, Floats, Ints, ObservationConfig, Snapshot
 
-STRETCH = 3  # a buffer is this many histories long, so that a history is always one contiguous view
+STRETCH = 3  # buffer length in histories, so that a history is always one contiguous view
 
 
 class FrameBuffer:
-    """[K,S,...] frames of numbered slots, one per vehicle that is present; K = `STRETCH` N.
+    """[K,S,...] frames of numbered slots, one per present vehicle; K = `STRETCH` N.
 
     Args:
-        frames: N, how many frames a history has.
-        slots: how many vehicles fit at first; the buffer grows as needed.
+        frames: N, length of a history.
+        slots: initial number of vehicles; the buffer grows as needed.
         absent: the value of a slot in the frames before its vehicle appeared.
-        cell: shape of what is kept of one vehicle in one frame.
+        cell: shape of one vehicle's data in one frame.
         dtype: its type.
     """
 
@@ -30,11 +30,11 @@ class FrameBuffer:
         self.clear()
 
     def clear(self) -> None:
-        """A new episode: no vehicle is known. The buffer stays, so that its memory is touched only once."""
+        """Start an episode without known vehicles. The buffer is reused to avoid new page faults."""
         self._assign(())
 
     def next_frame(self, vehicles: tuple[str, ...]) -> tuple[npt.NDArray[Any], Ints]:
-        """The new frame [S,...], to be written into, and the slot [n] of each of the present vehicles."""
+        """The new frame [S,...] to write into, and the slot [n] of each present vehicle."""
         if self._end == len(self._buffer):
             used = list(self._slot.values())
             self._buffer[: self._frames, used] = self._buffer[-self._frames :, used]
@@ -50,7 +50,7 @@ class FrameBuffer:
         return self._buffer[self._end - self._frames : self._end]
 
     def _assign(self, vehicles: tuple[str, ...]) -> None:
-        """Give a slot to every vehicle that came, and free those of the vehicles that left."""
+        """Assign slots to new vehicles, and free the slots of vehicles that left."""
         for name in self._slot.keys() - set(vehicles):
             self._free.append(self._slot.pop(name))
         for name in vehicles:
@@ -63,7 +63,7 @@ class FrameBuffer:
         self._vehicles = vehicles
 
     def _grow(self) -> None:
-        """Twice as many slots; the lowest of the new ones is taken first."""
+        """Double the slots; the lowest new slot is used first."""
         count, have, *cell = self._buffer.shape
         more = np.empty((count, max(have, 8), *cell), self._buffer.dtype)
         self._buffer = np.concatenate([self._buffer, more], axis=1)
@@ -93,5 +93,5 @@ class MapPast(FrameBuffer):
         super().__init__(config.frames, 0, 0.0, cell, np.uint8)
 
     def view(self, av: str) -> Bytes:
-        """[N,C,H,W] oldest first; stays as it is for N further frames at least."""
+        """[N,C,H,W] oldest first; valid for at least N further frames."""
         return self.window[:, self._slot[av]]

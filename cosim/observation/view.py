@@ -1,7 +1,7 @@
-"""What an agent outside the simulation's process sees of one AV, and how it is sent there in few bytes.
+"""The observation of an agent outside the simulation's process, and its compact transfer.
 
-A `History` carries the lane paths of its route: too much to pickle at every decision. A `View` holds what
-an agent needs of them as plain arrays, and of the N maps only the new ones cross (`Unpacker` keeps the rest).
+A `History` contains the lane paths of its route: too much to pickle at every decision. A `View` holds the
+needed part as plain arrays, and of the N maps only the new ones are sent (`Unpacker` keeps the rest).
 """
 
 from collections.abc import Mapping
@@ -18,10 +18,10 @@ SIDES = ("left", "keep", "right")
 
 
 class View(NamedTuple):
-    """What one AV sees at one decision, as plain arrays (m, m/s, rad, s).
+    """One AV's observation at one decision, as plain arrays (m, m/s, rad, s).
 
     Sides are left, keep, right. N frames are oldest first; R rows are vehicles; P = 11 points lie 0, 10, ...
-    100 m ahead. Masks are advice: a masked lane change is answered by a receipt that says why it was refused.
+    100 m ahead. Masks are advice: the receipt of a masked lane change gives the reason of its refusal.
 
     Attributes:
         velocity_map: [N,C,H,W] pixel * 255; [N,C,0,0] without maps.
@@ -32,13 +32,13 @@ class View(NamedTuple):
         target_speed: m/s, the present command (the speed while SUMO drives).
         lane_changing: +1 / -1 while a change to the left / right is under way, else 0.
         speed_limit: m/s.
-        to_dead_end: [3] m until the lane stops leading on; inf: it does not, 0: there is no lane.
+        to_dead_end: [3] m to the dead end of the lane; inf: none, 0: there is no lane.
         conflict_distance: m to the conflict zone along the present lane; inf when none is ahead.
         lane_exists: [3] whether there is a lane.
         centre_lines: [3,P,2] m in the AV's frame (x ahead, y left); 0 where there is no lane.
         action_mask: [A] False for a lane change towards no lane, or while one is under way.
         time: s.
-        rules: the law on its own way: signals, stop lines, crossings, limits.
+        rules: the law on its own route: signals, stop lines, crossings, limits.
         age: [R] s since the newest measurement of each row's vehicle; 0 with ideal sensing.
         source: [R] `cosim.types.Source` of that measurement.
         decision_latency: s until an action given now acts; the command before holds until then.
@@ -70,10 +70,10 @@ class View(NamedTuple):
 
 
 class Packed(NamedTuple):
-    """Views of B AVs as a few stacked arrays: what is pickled."""
+    """Views of B AVs as a few stacked arrays, for pickling."""
 
     avs: tuple[str, ...]  # B
-    maps: Bytes  # [B - newcomers, k, C,H,W] the k new frames of AVs whose earlier maps were sent before
+    maps: Bytes  # [B - newcomers, k, C,H,W] the k new frames of AVs with earlier maps at the receiver
     new_maps: Bytes  # [newcomers, N, C,H,W]
     newcomers: tuple[str, ...]
     kinematics: Floats32  # [B,N,R,F]
@@ -82,7 +82,7 @@ class Packed(NamedTuple):
     # [B,23] pose 3, target speed, change, limit, dead ends 3, conflict, time, latency; of `rules` the
     # signal's state (0: none), all other fields in their order, and how many rows of `limits`
     numbers: Floats
-    limits: Floats  # [k,2] m, m/s: those of all AVs one after the other
+    limits: Floats  # [k,2] m, m/s: of all AVs, concatenated
     lanes: Bools  # [B,3]
     lines: Floats32  # [B,3,P,2]
     age: Floats  # [B,R]
@@ -90,13 +90,13 @@ class Packed(NamedTuple):
 
 
 class Packer:
-    """The simulation's side: remembers whose maps the other side holds."""
+    """The simulation's side: tracks the maps that the agent's side already holds."""
 
     def __init__(self) -> None:
         self._sent: frozenset[str] = frozenset()
 
     def pack(self, histories: Mapping[str, History], fresh: int | None) -> Packed:
-        """The views of all AVs, to be sent to the other side.
+        """The views of all AVs, for the agent's side.
 
         Args:
             histories: AV id -> its history at this decision.
@@ -136,7 +136,7 @@ class Packer:
 
 
 class Unpacker:
-    """The agent's side: puts the new maps behind the ones it has."""
+    """The agent's side: appends the new maps to the earlier ones."""
 
     def __init__(self) -> None:
         self._maps: dict[str, Bytes] = {}
@@ -185,7 +185,7 @@ class Unpacker:
 
 
 def views(histories: Mapping[str, History]) -> dict[str, View]:
-    """What an agent in the simulation's own process sees: AV id -> View."""
+    """The views of an agent in the simulation's own process: AV id -> View."""
     return Unpacker().unpack(Packer().pack(histories, None))
 
 
@@ -198,7 +198,7 @@ def _by_row(columns: list[npt.NDArray[Any]], histories: list[History], dtype: An
 
 
 def _lines(histories: list[History]) -> tuple[Floats32, Bools]:
-    """Centre lines ahead in each AV's frame [B,3,P,2] m and which lanes there are [B,3]."""
+    """Centre lines ahead in each AV's frame [B,3,P,2] m, and existence of the lanes [B,3]."""
     lines = np.zeros((len(histories), len(SIDES), len(LOOK_AHEAD), 2), np.float32)
     exists = np.zeros((len(histories), len(SIDES)), np.bool_)
     for b, h in enumerate(histories):
@@ -209,7 +209,7 @@ def _lines(histories: list[History]) -> tuple[Floats32, Bools]:
             if path is None:
                 continue
             exists[b, side] = True
-            dx = np.interp(arc, path.arc, path.points[:, 0]) - x0  # a path that ends stays at its end
+            dx = np.interp(arc, path.arc, path.points[:, 0]) - x0  # a path repeats its last point
             dy = np.interp(arc, path.arc, path.points[:, 1]) - y0
             lines[b, side, :, 0] = c * dx + s * dy
             lines[b, side, :, 1] = c * dy - s * dx

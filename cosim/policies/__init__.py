@@ -1,4 +1,4 @@
-"""Every policy that `--policy` can name: those that ship, weights of a training, a user's own code."""
+"""Every policy for `--policy`: shipped policies, weights of a training, a user's own code."""
 
 from pathlib import Path
 from typing import Protocol
@@ -12,20 +12,20 @@ from policy import agents
 
 
 class Explainer(Protocol):
-    """Tells which inputs a choice hangs on, decision by decision (`policy.attribution.Explainer`)."""
+    """Attribution of each choice to the network's inputs (`policy.attribution.Explainer`)."""
 
-    asked: str | None  # the AV
+    asked: str | None  # the observed AV
     uses: tuple[tuple[str, str, int, float], ...]  # input, replacement, action then, mean |dQ|
 
 
-NAMES = tuple(agents.POLICIES)  # of those that ship
-TRAINABLE = agents.TRAINABLE  # those that `cosim train NAME` makes
+NAMES = tuple(agents.POLICIES)  # of shipped policies
+TRAINABLE = agents.TRAINABLE  # policies for `cosim train NAME`
 
 
 def check(text: str, field: str = "--policy") -> None:
-    """Raises BadInput when there is no such policy: names the nearest, or what its file lacks.
+    """Raises BadInput for an unknown policy, naming the nearest one or the fault of its file.
 
-    `field`: where the policy was named.
+    `field`: the option or field with the policy's name.
     """
     try:
         _check(text)
@@ -46,7 +46,7 @@ def _check(text: str) -> None:
         problem = f"a policy that ships is called {name.label}: label yours otherwise"
         raise BadInput(problem, field="--policy", value=text)
     elif name.place.endswith(WEIGHTS):
-        from cosim.policies.trained import config  # torch: only when it is asked for
+        from cosim.policies.trained import config  # torch: only when needed
 
         config(Path(name.place))
     else:
@@ -54,7 +54,7 @@ def _check(text: str) -> None:
 
 
 def explainer(policy: Policy) -> Explainer | None:
-    """What tells which inputs a choice of this policy hangs on; None where it has no value network."""
+    """The attribution of this policy's choices; None without a value network."""
     from policy.agents.prediction_aware import PredictionAware
     from policy.attribution import Explainer as Asking
 
@@ -62,14 +62,14 @@ def explainer(policy: Policy) -> Explainer | None:
 
 
 def compensator(name: str, road: RoadMap, timing: Timing) -> Compensator:
-    """What predicts a sensing level's late states to now, by the name of its compensation."""
-    from cosim.policies.compensation import COMPENSATORS  # torch: only when it is asked for
+    """The predictor that compensates a sensing level's delay, by its name."""
+    from cosim.policies.compensation import COMPENSATORS  # torch: only when needed
 
     return COMPENSATORS[name](road, timing)
 
 
 def make(text: str) -> Policy:
-    """A fresh policy. Raises BadInput as `check`, and when its weights or its code do not do."""
+    """A fresh policy. Raises BadInput as `check`, and for unusable weights or code."""
     name = read(text)
     if name.ships:
         return agents.make(name.label)

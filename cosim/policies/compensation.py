@@ -1,4 +1,4 @@
-"""Late states predicted to now by what the agent predicts with: the Gaussian process, or the HPN."""
+"""Delay compensation with the agent's predictors: the Gaussian process, or the HPN."""
 
 from collections.abc import Callable
 
@@ -13,12 +13,12 @@ from policy.prediction.predictors import make_predictor
 from policy.prediction.traffic import TrafficConfig
 
 GP, HPN = "gp", "hpn"  # compensations
-PAST = 10  # frames, as of every history
-HORIZON = 4.0  # s: older states are predicted no further
+PAST = 10  # frames, as in every history
+HORIZON = 4.0  # s, cap of the predicted time
 
 
 class GaussianProcess:
-    """`cosim.types.Compensator`: the speed of the Gaussian process along the lanes of `road`."""
+    """`cosim.types.Compensator`: the Gaussian process's speed along the lanes of `road`."""
 
     frames = PAST
 
@@ -35,7 +35,7 @@ class GaussianProcess:
 
 
 class HybridPredictiveNetwork:
-    """`cosim.types.Compensator`: what the shipped HPN makes of that, each AV by its own tracks."""
+    """`cosim.types.Compensator`: the shipped HPN's correction of that, for each AV's own tracks."""
 
     frames = PAST
 
@@ -54,7 +54,7 @@ COMPENSATORS: dict[str, Callable[[RoadMap, Timing], Compensator]] = {
 
 
 def _at(forecast: KinematicForecast, tracks: Tracks, dt: float) -> Floats:
-    """[V,4] a forecast [V,M], `dt` s between frames, at the age of each track."""
+    """[V,4] a forecast [V,M] with frames of `dt` s, interpolated at the age of each track."""
     horizon = forecast.x.shape[1]
     columns = {X: forecast.x, Y: forecast.y, SPEED: forecast.speed, HEADING: forecast.heading}
     frames = np.minimum(tracks.age / dt, horizon - 1e-6)  # [V]

@@ -1,4 +1,4 @@
-"""A user's own policy behind our protocol: class, factory or function; errors name the user's code."""
+"""A user's own policy as `cosim.types.Policy`: class, factory or function; errors name the user's code."""
 
 import inspect
 import operator
@@ -21,16 +21,16 @@ from cosim.types import (
     PolicyContext,
 )
 
-NEEDED = ("observation", "reset", "decide")  # of `cosim.types.Policy`; the rest has defaults
+NEEDED = ("observation", "reset", "decide")  # required members of `cosim.types.Policy`
 ACTIONS = f"0 to {len(MetaAction) - 1}"
 
 
 class OwnPolicy:
-    """`cosim.types.Policy` around an object of the user's.
+    """`cosim.types.Policy` around a user's object.
 
     A decision may be a `Decision`, a `MetaAction`, its number, or None: SUMO drives that AV.
 
-    Raises BadInput whenever his code raises or answers something else, naming the file and line.
+    Raises BadInput, naming file and line, when the user's code raises or returns another value.
     """
 
     def __init__(self, inner: Any, name: PolicyName) -> None:
@@ -57,23 +57,23 @@ class OwnPolicy:
         self.files = tuple(f for f in (file, *more) if f is not None)
 
     def looks_ahead(self, look: LookAhead) -> None:
-        """His, if he has one (`cosim.types.LooksAhead`)."""
+        """Calls the user's method, if defined (`cosim.types.LooksAhead`)."""
         if isinstance(self._inner, LooksAhead):
             guarded(self._place, "looks_ahead", self._inner.looks_ahead, look)
 
     def reset(self, context: PolicyContext) -> None:
-        """A new episode begins."""
+        """Start an episode."""
         guarded(self._place, "reset", self._inner.reset, context)
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
-        """One decision per AV he wants to command."""
+        """One decision per AV that the user's code commands."""
         answer = guarded(self._place, "decide", self._inner.decide, histories)
         if not isinstance(answer, Mapping):
             raise self._wrong("must return a mapping of AV to decision", "decide", type(answer).__name__)
         found = {}
         for av, decision in answer.items():
             if av not in histories:
-                raise self._wrong(f"decided for one that is no AV on the road: {av!r}", "decide")
+                raise self._wrong(f"decided for an id that is no AV on the road: {av!r}", "decide")
             if decision is not None:
                 found[av] = self._decision(decision)
         return found
@@ -91,9 +91,9 @@ class OwnPolicy:
 
 
 class PerVehicle:
-    """A function of one AV's `cosim.View`, as `Session.act` wants it, that commands every AV alike.
+    """A function from one AV's `cosim.View` to an action of `Session.act`, applied to every AV.
 
-    Its attribute `observation` is what it wants to see; without one it sees compact maps.
+    Its attribute `observation` configures the view; the default is compact maps.
     """
 
     def __init__(self, act: Callable[[View], Any]) -> None:
@@ -101,17 +101,17 @@ class PerVehicle:
         self.observation = getattr(act, "observation", COMPACT)
 
     def reset(self, context: PolicyContext) -> None:
-        """It remembers nothing."""
+        """Nothing to reset: the function has no state."""
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, Any]:
-        """What the function returns for each."""
+        """The function's result for each AV."""
         return {av: self._act(view) for av, view in views(histories).items()}
 
 
 def own(name: PolicyName) -> OwnPolicy:
-    """A fresh policy of the user's.
+    """A fresh instance of a user's policy.
 
-    Raises BadInput: it cannot be imported, there is nothing of that name, it cannot be called.
+    Raises BadInput when it cannot be imported, found or called.
     """
     found = name.code.load("--policy")
     if _takes_one(found):
@@ -120,7 +120,7 @@ def own(name: PolicyName) -> OwnPolicy:
 
 
 def _takes_one(found: Any) -> bool:
-    """Whether it is a function that must be given something: a view."""
+    """Whether `found` is a function with a required argument, the view."""
     if not inspect.isfunction(found):
         return False
     needed = [p for p in inspect.signature(found).parameters.values() if p.default is p.empty]

@@ -1,4 +1,4 @@
-"""The agent of a training, built again from its weights and their card."""
+"""A trained agent, rebuilt from its weights and their card."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +28,7 @@ Section = TypeVar("Section")
 
 
 def trained(name: PolicyName) -> PredictionAware:
-    """The approach at the sizes it was trained with; HPN and predictors are the shipped ones.
+    """The approach at its training sizes; HPN and predictors are the shipped ones.
 
     Raises BadInput (WeightsMismatch is one) when the card or the weights do not fit.
     """
@@ -36,7 +36,7 @@ def trained(name: PolicyName) -> PredictionAware:
 
 
 def config(weights: Path) -> AgentConfig:
-    """What the card of `weights` says of the agent. Raises BadInput naming the card and the field."""
+    """The agent's configuration from the card of `weights`. Raises BadInput naming card and field."""
     card, file = read_card(weights), weights.with_suffix(".json")
     about: dict[str, Any] = card["data"]
     approach = about.get("policy")

@@ -1,1 +1,1 @@
-"""Recorded episodes: what was driven, written once, read back as snapshots, tracks and histories."""
+"""Recorded episodes: written once, read back as snapshots, tracks and histories."""

@@ -1,4 +1,4 @@
-"""One episode as one Parquet file: a row per vehicle and frame, written whole or not at all."""
+"""One episode as one Parquet file: a row per vehicle and frame, written atomically."""
 
 import base64
 import json
@@ -20,12 +20,12 @@ from cosim.recording.recorder import Knowledge, Recorder
 from cosim.types import Bytes, Collision, Entry, Events, HumanError, Intervention, Overlap, Snapshot
 
 FORMAT = "cosim-recording-1"
-# float64, so that a recording gives back exactly what was driven: histories built from it equal the policy's
-# bit for bit. float32 would be half as large (70 against 135 kB for 40 s of 30 vehicles), but turns headings
-# near +-pi by a whole circle and moves target speeds.
+# float64, so that histories rebuilt from a recording equal the policy's bit for bit. float32 would be half as
+# large (70 against 135 kB for 40 s of 30 vehicles), but turns headings near +-pi by a whole circle and
+# changes target speeds.
 REAL = ("x", "y", "heading", "speed", "accel", "length", "width", "lane_position")
 WHOLE: dict[str, Any] = {"kind": pa.int8(), "mission": pa.bool_(), "lane": pa.int32(), "actor": pa.int8()}
-HAPPENED: dict[str, Any] = {
+EVENT_FIELDS: dict[str, Any] = {
     "collisions": Collision,
     "entries": Entry,
     "interventions": Intervention,
@@ -38,7 +38,7 @@ SCHEMA = pa.schema(
         ("vehicle", pa.int32()),  # index into the ids of the file's metadata
         *WHOLE.items(),
         *((name, pa.float64()) for name in REAL),
-        ("route", pa.int32()),  # index into the routes of the metadata; null where no AV decides
+        ("route", pa.int32()),  # index into the routes of the metadata; null without a deciding AV
         ("target_speed", pa.float64()),  # m/s; null while SUMO drives
         ("lane_changing", pa.int8()),
     ]
@@ -55,7 +55,7 @@ class Recording:
     first: int  # frame at which the episode's clock is 0
     table: Mapping[str, npt.NDArray[Any]]  # column -> [L]
     routes: tuple[tuple[str, ...], ...]
-    events: Mapping[int, Events]  # frame -> what happened, where anything did
+    events: Mapping[int, Events]  # frame -> events, for frames with any
     signals: Bytes  # [T,s] the states of the signals, see `Snapshot.signals`
 
     def snapshots(self) -> list[Snapshot]:
@@ -68,10 +68,10 @@ class Recording:
         before: npt.NDArray[np.int32] = np.zeros(0, np.int32)
         for k, time in enumerate(self.times):
             rows = order[cuts[k] : cuts[k + 1]]
-            who = t["vehicle"][rows]
+            present = t["vehicle"][rows]
             numbers: dict[str, Any] = {name: t[name][rows].astype(np.float64) for name in REAL}
-            if not np.array_equal(who, before):  # the same tuple while nobody comes or goes
-                names, before = tuple([self.ids[i] for i in who]), who
+            if not np.array_equal(present, before):  # the same tuple while the set of vehicles is unchanged
+                names, before = tuple([self.ids[i] for i in present]), present
             frames.append(
                 Snapshot(
                     time=float(time),
@@ -88,7 +88,7 @@ class Recording:
         return frames
 
     def known(self) -> dict[int, dict[str, Knowledge]]:
-        """Decision frame -> AV -> what it knew beside the traffic."""
+        """Decision frame -> AV -> its knowledge besides the traffic."""
         t = self.table
         found: dict[int, dict[str, Knowledge]] = {}
         for row in self._by_frame[t["route"][self._by_frame] >= 0]:
@@ -106,10 +106,10 @@ class Recording:
 
 
 def write(path: Path, recorder: Recorder, case: Mapping[str, Any]) -> None:
-    """Write the recorded episode to `path`; until it is whole it has another name. Raises BadInput."""
+    """Write the recorded episode to `path` atomically. Raises BadInput."""
     columns: dict[str, npt.NDArray[Any]]
     ids, frame, vehicle, columns = recorder.vehicles(*WHOLE, *REAL)
-    empty = Knowledge((), float("nan"))  # of an AV that decides nothing
+    empty = Knowledge((), float("nan"))  # of an AV without a decision
     known = [recorder.known.get(k, {}).get(ids[i]) for k, i in zip(frame, vehicle, strict=True)]
     routes = {r: k for k, r in enumerate(dict.fromkeys(a.route for a in known if a is not None))}
     columns |= {"frame": frame, "vehicle": vehicle}
@@ -132,7 +132,7 @@ def write(path: Path, recorder: Recorder, case: Mapping[str, Any]) -> None:
         "ids": ids,
         "routes": list(routes),
         "events": events,
-        # one byte per frame and signal, compressed: most stay as they were in the frame before
+        # one byte per frame and signal, compressed: most states do not change
         "signals": base64.b64encode(zlib.compress(b"".join(s.signals.tobytes() for s in frames))).decode(),
     }
     table = pa.Table.from_arrays(arrays, schema=SCHEMA.with_metadata({"cosim": json.dumps(about)}))
@@ -179,12 +179,12 @@ def _recording(about: Mapping[str, Any], table: pa.Table) -> Recording:
 
 def _events(document: Mapping[str, Any]) -> Events:
     found = {name: _tuples(values) for name, values in document.items()}
-    for name, kind in HAPPENED.items():
+    for name, kind in EVENT_FIELDS.items():
         made = ({field: _tuples(value) for field, value in one.items()} for one in found.get(name, ()))
         found[name] = tuple(kind(**one) for one in made)
     return Events(**found)
 
 
 def _tuples(value: Any) -> Any:
-    """JSON knows lists only."""
+    """JSON has lists only: convert them to tuples."""
     return tuple(map(_tuples, value)) if isinstance(value, list) else value

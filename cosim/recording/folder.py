@@ -1,4 +1,4 @@
-"""A folder of recordings: which episodes there are, which are still missing, and on which road."""
+"""A folder of recordings: present and missing episodes, and their roads."""
 
 import hashlib
 import json
@@ -19,7 +19,7 @@ def seed_of(key: str) -> int:
 
 
 def fits(case: Mapping[str, Any], scenarios: Sequence[str], behaviors: Sequence[str]) -> bool:
-    """Whether a recording is of one of these scenarios and behaviours; none named: of any."""
+    """Whether a recording is of one of these scenarios and behaviours; an empty list matches any."""
     return (not scenarios or case["scenario"] in scenarios) and (
         not behaviors or case["behavior"] in behaviors
     )
@@ -28,8 +28,8 @@ def fits(case: Mapping[str, Any], scenarios: Sequence[str], behaviors: Sequence[
 class Folder:
     """`DIR/manifest.json`, `DIR/episodes/KEY.parquet`, `DIR/roads/HASH.json`.
 
-    An episode is there when its file is: files appear whole, so a killed recorder leaves no half episode,
-    and one that is resumed leaves out what is there.
+    Files are written atomically, so a killed recorder leaves no partial episode. A resumed recorder skips
+    existing episodes.
     """
 
     def __init__(self, path: Path) -> None:
@@ -53,7 +53,7 @@ class Folder:
         return self.episode_file(key).is_file()
 
     def episodes(self, seeds: range | None = None) -> list[str]:
-        """Keys of the episodes that are there, sorted; with `seeds` of these alone."""
+        """Keys of the existing episodes, sorted; with `seeds`, of these seeds only."""
         keys = sorted(file.stem for file in (self.path / "episodes").glob("*.parquet"))
         return [key for key in keys if seeds is None or seed_of(key) in seeds]
 
@@ -65,11 +65,11 @@ class Folder:
         return found
 
     def write_manifest(self, document: Mapping[str, Any]) -> None:
-        """Replace the manifest whole."""
+        """Replace the manifest atomically."""
         _write_whole(self.manifest_file, json.dumps({"format": FORMAT, **document}, indent=1) + "\n")
 
     def add_road(self, road: RoadMap) -> str:
-        """Store a road once; returns its name, which the episodes' cases carry."""
+        """Store a road once; returns its name for the episodes' cases."""
         text = roads.text(road)
         name = hashlib.sha256(text.encode()).hexdigest()[:16]
         file = self.path / "roads" / f"{name}.json"
@@ -78,14 +78,14 @@ class Folder:
         return name
 
     def road(self, recording: Recording) -> RoadMap:
-        """The road a recording was driven on. Raises BadInput."""
+        """The road of a recording. Raises BadInput."""
         name = str(recording.case["road"])
         if name not in self._roads:
             self._roads[name] = roads.read_road(self.path / "roads" / f"{name}.json")
         return self._roads[name]
 
     def recordings(self, scenarios: Sequence[str] = (), behaviors: Sequence[str] = ()) -> Iterator[Recording]:
-        """Every episode, by key; only the named scenarios and behaviours where any are named."""
+        """Every episode, by key; limited to the named scenarios and behaviours if any are named."""
         for key in self.episodes():
             recording = read(self.episode_file(key))
             if scenarios and recording.case["scenario"] not in scenarios:

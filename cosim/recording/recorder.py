@@ -1,4 +1,4 @@
-"""The one recorder of an episode: a hook that keeps what was driven, decided and predicted."""
+"""The recorder of an episode: a hook that stores motion, decisions and predictions."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,11 +21,11 @@ from cosim.types import (
     Unseen,
 )
 
-DRAWN = 400_000  # vehicle frames of a drawing: about 2 MB of page
+MAX_DRAWN_FRAMES = 400_000  # vehicle frames of a replay page: about 2 MB
 
 
 class Knowledge(NamedTuple):
-    """What an AV knew beside the traffic at one decision: enough to build its `History` anew."""
+    """An AV's knowledge besides the traffic at one decision, enough to rebuild its `History`."""
 
     route: tuple[str, ...] = ()  # edges still ahead, the present one first
     target_speed: float | None = None  # m/s; None while SUMO drives it
@@ -34,26 +34,26 @@ class Knowledge(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """What one AV decided, and what became of it."""
+    """One AV's decision and its outcome."""
 
     decision: Decision
     target: float  # m/s, the speed commanded
-    blocked: str | None  # why the command was not executed
+    blocked: str | None  # reason why the command was not executed
 
 
 class Belief(NamedTuple):
-    """How what one AV knew at a decision differs from the truth of that moment: k vehicles and persons."""
+    """One AV's belief about k vehicles and persons at a decision, relative to the truth of that moment."""
 
     ids: tuple[str, ...]
-    x: Floats  # [k] m, where it took each to be, less where it was
+    x: Floats  # [k] m, believed minus true position
     y: Floats  # [k] m
     age: Floats  # [k] s since the newest measurement
     source: Ints  # [k] `Source` of that
-    unseen: Mapping[str, Unseen]  # whom its own sensors did not detect though in range
+    unseen: Mapping[str, Unseen]  # objects in range that its own sensors did not detect
 
 
 def beliefs(frame: Snapshot) -> dict[str, Belief] | None:
-    """AV -> what it knew of those on the road; None where sensing is ideal."""
+    """AV -> its belief about the traffic; None with ideal sensing."""
     if frame.percepts is None:
         return None
     found = {}
@@ -69,22 +69,22 @@ def beliefs(frame: Snapshot) -> dict[str, Belief] | None:
 
 
 class Recorder(Hook):
-    """Keeps the last episode; `recording.file.write` stores it, `recording.replay_data` reads it.
+    """Holds the last episode; `recording.file.write` stores it, `recording.replay_data` reads it.
 
-    `limit`: vehicle frames kept at most; beyond, every second frame goes, which is enough to draw from.
-    `policy`: whose forecasts are kept.
+    `limit`: largest number of vehicle frames; beyond it every second frame is dropped, enough for drawing.
+    `policy`: source of the forecasts.
     """
 
     def __init__(self, policy: Policy | None = None, limit: float = np.inf) -> None:
         self._policy, self._limit = policy, limit
 
     def on_start(self, episode: Episode) -> None:
-        """The warm-up's last frames come first."""
+        """Begin with the warm-up's last frames."""
         self.begin(episode.frames)
         self._know(episode)
 
     def on_step(self, episode: Episode, step: Step) -> None:
-        """Its frames, its decisions, and what the policy predicted for them."""
+        """Add the step's frames, decisions and the policy's forecast."""
         self.decided.append(step.before.time)
         self.forecasts.append(getattr(self._policy, "last_forecast", None) if step.decisions else None)
         self.beliefs.append(beliefs(step.before))
@@ -98,11 +98,11 @@ class Recorder(Hook):
         self._know(episode)
 
     def begin(self, frames: Sequence[Snapshot]) -> None:
-        """Discard the last episode; the clock of the next one is 0 at the last of these frames."""
+        """Discard the last episode; the next episode's clock is 0 at the last of these frames."""
         self.frames: list[Snapshot] = [_truth(frame) for frame in frames]
         self.first = len(frames) - 1
-        self.known: dict[int, dict[str, Knowledge]] = {}  # decision frame -> AV -> what it knew
-        self.decided: list[float] = []  # s, when decisions were taken
+        self.known: dict[int, dict[str, Knowledge]] = {}  # decision frame -> AV -> knowledge
+        self.decided: list[float] = []  # s, time of each decision
         self.choices: list[dict[str, Choice]] = []
         self.forecasts: list[Forecast | None] = []
         self.beliefs: list[dict[str, Belief] | None] = []  # of every decision
@@ -114,7 +114,7 @@ class Recorder(Hook):
         self._stride, self._driven, self._kept = 1, 0, sum(s.n for s in frames)
 
     def add(self, frame: Snapshot) -> None:
-        """One more frame; every second one goes once there are too many, and the forecasts of its time."""
+        """Add one frame; above the limit every second frame and its forecast are dropped."""
         self.collisions += frame.events.collisions
         self.interventions += frame.events.interventions
         self.errors += frame.events.errors
@@ -133,7 +133,7 @@ class Recorder(Hook):
             self.forecasts, self.beliefs = [f for f, _ in drawn], [b for _, b in drawn]
 
     def vehicles(self, *columns: str) -> tuple[list[str], Ints, Ints, dict[str, Any]]:
-        """Every vehicle in every frame: L rows, a vehicle's frames together.
+        """Every vehicle in every frame: L rows, grouped by vehicle.
 
         Returns: ids, sorted [V]; the frame and the vehicle (index into the ids) of each row [L]; the
         `columns` of `Snapshot` [L].
@@ -152,5 +152,5 @@ class Recorder(Hook):
 
 
 def _truth(frame: Snapshot) -> Snapshot:
-    """Without percepts, which take a lot of room."""
+    """The snapshot without percepts, to save memory."""
     return frame if frame.percepts is None else replace(frame, percepts=None)

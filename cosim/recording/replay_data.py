@@ -1,4 +1,4 @@
-"""A recorded episode as it is drawn: every vehicle's track, every decision and what became of it."""
+"""A recorded episode for drawing: every vehicle's track, every decision and its outcome."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -26,7 +26,7 @@ from cosim.types import (
 
 @dataclass(frozen=True)
 class Track:
-    """One vehicle's drive without a gap, k frames from frame `first` on."""
+    """One vehicle's uninterrupted track, k frames from frame `first` on."""
 
     id: str
     kind: Kind
@@ -50,27 +50,27 @@ class ReplayData:
 
     facts: Mapping[str, Any]  # the document of `cosim run --json`
     road: RoadMap
-    begin: float  # s, when the counted time began
+    begin: float  # s, start of the counted time
     interval: float  # s between frames
     times: Floats  # [T] s
     tracks: tuple[Track, ...]
-    decided: Floats  # [D] s, when decisions were taken
+    decided: Floats  # [D] s, times of the decisions
     choices: tuple[Mapping[str, Choice], ...]  # [D] AV -> choice
-    forecasts: tuple[Forecast | None, ...]  # [D] what the policy predicted then
+    forecasts: tuple[Forecast | None, ...]  # [D] the policy's forecast at that time
     collisions: tuple[Collision, ...]
     goal: frozenset[int] = frozenset()  # lanes on which the mission is fulfilled
     signals: Bytes = field(default_factory=lambda: np.zeros((0, 0), np.uint8))  # [T,s] as in `Snapshot`
     offences: tuple[Offence, ...] = ()
     interventions: tuple[Intervention, ...] = ()
-    beliefs: tuple[Mapping[str, Belief] | None, ...] = ()  # [D] AV -> what it knew; None: everything
-    errors: tuple[HumanError, ...] = ()  # those of the warm-up that went on into the counted time first
+    beliefs: tuple[Mapping[str, Belief] | None, ...] = ()  # [D] AV -> belief; None with ideal sensing
+    errors: tuple[HumanError, ...] = ()  # first those that began in the warm-up
 
 
 def replay_data(recorder: Recorder, simulator: Simulator, facts: Mapping[str, Any]) -> ReplayData:
     """The counted time of the recorded episode, driven on `simulator`."""
     frames = recorder.frames[recorder.first :]
     times = np.array([s.time for s in frames])
-    # only SUMO's simulator knows them
+    # available from SUMO's simulator only
     drivers: Mapping[str, str] = getattr(simulator, "driver_classes", dict)()
     return ReplayData(
         facts=facts,
@@ -93,7 +93,7 @@ def replay_data(recorder: Recorder, simulator: Simulator, facts: Mapping[str, An
 
 
 def tracks(recorder: Recorder, drivers: Mapping[str, str]) -> list[Track]:
-    """One for every stretch of frames in which a vehicle is on the road; `drivers`: each HV's class by id."""
+    """One track per uninterrupted presence of a vehicle; `drivers`: each HV's class by id."""
     body, motion = ("kind", "mission", "length", "width", "actor"), ("x", "y", "heading", "speed", "accel")
     ids, frame, vehicle, table = recorder.vehicles(*body, *motion, "lane")
     counted = np.flatnonzero(frame >= recorder.first)

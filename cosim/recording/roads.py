@@ -16,7 +16,7 @@ FORMAT = "cosim-road-1"
 
 
 def text(road: RoadMap) -> str:
-    """Everything a RoadMap holds as JSON: floats survive exactly, the same road gives the same text."""
+    """A RoadMap as JSON, with exact floats; equal roads give equal text."""
     document = {
         "format": FORMAT,
         "lanes": [vars(lane) | {"shape": lane.shape.tolist()} for lane in road.lanes],
@@ -49,7 +49,7 @@ def read_road(file: Path) -> RoadMap:
 
 
 def _read(kind: type[Any], values: Mapping[str, Any]) -> Any:
-    """Its sequences are tuples, its shape an array."""
+    """An object of `kind`; sequences become tuples, the shape an array."""
     tuples = {name: tuple(value) for name, value in values.items() if isinstance(value, list)}
     shape = {"shape": np.array(values["shape"], float)} if "shape" in values else {}
     return kind(**{**values, **tuples, **shape})

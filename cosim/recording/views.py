@@ -1,4 +1,4 @@
-"""Recordings as learners need them: tracks of all vehicles, and each AV's histories built anew."""
+"""Recordings for learners: tracks of all vehicles, and the rebuilt histories of each AV."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from cosim.types import Bools, Floats, History, Ints, Kind, ObservationConfig
 
 
 class Tracks(NamedTuple):
-    """Every vehicle over a whole episode; nan (or -1) where it is not on the road."""
+    """Every vehicle over a whole episode; nan (or -1) while it is off the road."""
 
     state: Floats  # [V,T,4] x m, y m, speed m/s, heading rad (unwrapped)
     lane: Ints  # [V,T]
@@ -44,9 +44,9 @@ def tracks(recording: Recording) -> Tracks:
 def histories(
     recording: Recording, road: RoadMap, config: ObservationConfig
 ) -> Iterator[tuple[int, dict[str, History]]]:
-    """(frame, AV -> History) at every decision, as the policy saw it, maps drawn on demand.
+    """(frame, AV -> History) at every decision, as observed by the policy; maps are drawn on demand.
 
-    Views inside a History stay valid for N further frames: copy what is kept longer.
+    Views inside a History stay valid for N further frames; copy them to keep them longer.
     """
     observer, known = Observer(road, config), recording.known()
     for frame, snapshot in enumerate(recording.snapshots()):
@@ -64,10 +64,10 @@ def histories(
 
 
 class Windows(NamedTuple):
-    """S moments of single vehicles: what was known of each, and what it did then."""
+    """S moments of single vehicles: the known past of each, and its future."""
 
-    past: Floats  # [S,N,4] x m, y m, speed m/s, heading rad (unwrapped); nan where it was not there
-    future: Floats  # [S,M,4] the same, continuing the past's headings; nan once it has left
+    past: Floats  # [S,N,4] x m, y m, speed m/s, heading rad (unwrapped); nan while absent
+    future: Floats  # [S,M,4] as `past`, with continuous headings; nan after the vehicle left
     lane: Ints  # [S] at the moment
     lane_position: Floats  # [S] m, front bumper
     length: Floats  # [S] m
@@ -78,8 +78,8 @@ class Windows(NamedTuple):
 def windows(
     recording: Recording, *, every: int, frames: int = 10, horizon: int = 20, perceived: float | None = 125.0
 ) -> Windows:
-    """Every vehicle on the road that an AV perceives (within `perceived` m; None: all), at every `every`th
-    frame of the counted time that has a frame ahead."""
+    """Every vehicle perceived by an AV (within `perceived` m; None: all), at every `every`th frame of the
+    counted time except the last."""
     t = tracks(recording)
     lead = np.full((len(t.state), frames, 4), np.nan)
     tail = np.full((len(t.state), horizon, 4), np.nan)
@@ -87,21 +87,21 @@ def windows(
     parts = []
     for k in range(recording.first, len(recording.times) - 1, every):
         here = t.state[:, k]  # [V,4]
-        who = np.flatnonzero(np.isfinite(here[:, 0]))
+        chosen = np.flatnonzero(np.isfinite(here[:, 0]))
         if perceived is not None:
-            avs = here[who[t.is_av[who]]]
-            gap2 = ((here[who, None, :2] - avs[None, :, :2]) ** 2).sum(2)
-            who = who[(gap2 <= perceived**2).any(1)]
+            avs = here[chosen[t.is_av[chosen]]]
+            gap2 = ((here[chosen, None, :2] - avs[None, :, :2]) ** 2).sum(2)
+            chosen = chosen[(gap2 <= perceived**2).any(1)]
         at = k + frames  # of frame k in `padded`
         parts.append(
             Windows(
-                padded[who, at - frames + 1 : at + 1],
-                padded[who, at + 1 : at + 1 + horizon],
-                t.lane[who, k],
-                t.lane_position[who, k],
-                t.length[who],
-                t.is_av[who],
-                np.full(len(who), k),
+                padded[chosen, at - frames + 1 : at + 1],
+                padded[chosen, at + 1 : at + 1 + horizon],
+                t.lane[chosen, k],
+                t.lane_position[chosen, k],
+                t.length[chosen],
+                t.is_av[chosen],
+                np.full(len(chosen), k),
             )
         )
     return Windows(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))

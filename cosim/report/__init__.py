@@ -1,1 +1,1 @@
-"""What rows say: statistics, comparisons and gates, reports, replays."""
+"""Evaluation of rows: statistics, comparisons and gates, reports, replays."""

@@ -1,4 +1,4 @@
-"""Which figures of B are better than those of A on equal seeds, which are worse, which show no difference."""
+"""Figures of B against A on equal seeds: better, worse, or without a difference."""
 
 import math
 from collections.abc import Mapping

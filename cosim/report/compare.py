@@ -35,16 +35,16 @@ PASSED, FAILED, SKIPPED = "passed", "failed", "skipped"
 
 @dataclass(frozen=True, slots=True)
 class PairedFigure:
-    """One measure of A and of B over the pairs in which it applies to both."""
+    """One measure of A and of B over the pairs with a value on both sides."""
 
     measure: Measure
     a: Figure
     b: Figure
     difference: Figure  # b - a
-    n: int  # pairs in which it applies to both sides
+    n: int  # pairs with a value on both sides
     na: int  # pairs in which it is NA on either side
     na_on_both: int  # pairs in which it is NA on both sides
-    hits: tuple[int, int] | None = None  # of a rate: episodes of A and of B in which it happened
+    hits: tuple[int, int] | None = None  # of a rate: episodes of A and of B with the event
     tallies: tuple[tuple[int, float], ...] = ()  # of an incidence: events and exposure of A, of B
     p: float | None = None  # of a rate: exact McNemar
 
@@ -119,7 +119,7 @@ class Comparison:
     b: str
     groups: list[Compared]
     checks: list[Check]
-    unmatched: tuple[list[str], list[str]]  # cells that only A, only B has
+    unmatched: tuple[list[str], list[str]]  # cells of A only, of B only
     unfinished: tuple[str, ...] = ()  # a line for each unfinished run: `37 of 80 episodes of DIR are driven`
     partial: bool = False  # whether thresholds judge unfinished runs
 

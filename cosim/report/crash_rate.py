@@ -1,4 +1,4 @@
-"""A cell of `cosim estimate`: events per million km with intervals, and how far to trust them."""
+"""A cell of `cosim estimate`: events per million km with intervals, and their reliability."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -14,7 +14,7 @@ from cosim.report.statistics import Figure, effective, pooled_rate
 from cosim.report.summary import incidence_document, status_counts
 from cosim.workers.tasks import OK
 
-MIN_EFFECTIVE_CRASHES = 10.0  # with fewer, intervals were measured to cover the truth less often than 95 %
+MIN_EFFECTIVE_CRASHES = 10.0  # with fewer, measured coverage of the intervals is below 95 %
 USEFUL_HALF_WIDTH = 0.5  # of an interval, relative to the rate
 SCALE_POWERS = -6.0, 6.0  # of ten: the range of multiples of the episodes that is searched
 MAX_CRASH_SHARE = (
@@ -77,7 +77,7 @@ def text(cell: Mapping[str, Any]) -> str:
 
 
 def _notes(cell: Mapping[str, Any]) -> list[str]:
-    """What limits the trust in the interval."""
+    """Limits of the interval's reliability."""
     if not cell["crashed_episodes"]:
         return ["no AV crashed: of the crash rate only the upper bound is known"]
     count = cell["episodes_needed"]

@@ -112,7 +112,7 @@ def _story(episodes: Sequence[EpisodeResult], mission: str) -> list[str]:
 
 
 def _mission(result: EpisodeResult, mission: str) -> str:
-    """Which vehicle is the mission vehicle, and what it has to do."""
+    """The mission vehicle and its task."""
     do, _ = MISSIONS.get(mission, DEFAULT_MISSION)
     driver = "human driver" if mission in MISSIONS else "driver"
     name = result.mission_vehicle or ""
@@ -136,7 +136,7 @@ def _outcome(result: EpisodeResult, episodes: Sequence[EpisodeResult], mission: 
 
 
 def _distances(result: EpisodeResult, beside: EpisodeResult) -> str:
-    """How much further all vehicles, AVs and humans drove than in the episode beside it."""
+    """Differences in distance of all vehicles, AVs and humans to the other episode."""
     differences = []
     for name, vehicles in (("dt_mean_m", "all vehicles"), ("dt_av_m", "AVs"), ("dt_hv_m", "humans")):
         here, there = (episode.metrics[name].value for episode in (result, beside))

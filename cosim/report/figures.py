@@ -1,4 +1,4 @@
-"""Which columns of the rows are figures, what they are called, their units, and which direction is better."""
+"""The figures among the columns of the rows: names, units and better direction."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -14,7 +14,7 @@ from cosim.types import RESERVED, TIMINGS, WEIGHT
 
 Row = Mapping[str, Any]  # one episode: a line of episodes.parquet, NA as None
 
-SHARE = "share"  # unit of figures that are shown in per cent, and compared in percentage points
+SHARE = "share"  # unit of figures in per cent, compared in percentage points
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Which episode of A belongs to which of B: the same traffic, driven by another policy or another version.
+"""Pairs of episodes of A and B: the same traffic under another policy or another version.
 
 A pair is one episode of each side that agree in all of `PAIR`, in `SETTINGS` and in the seed; a group is the
 pairs that agree in `PAIR`. Nothing is pooled over groups.
@@ -20,7 +20,7 @@ from cosim.report.summary import GROUP, mission_guessed, not_comparable
 from cosim.workers.tasks import BAD_INPUT, OK
 
 PAIR = tuple(name for name in GROUP if name != "policy")
-ACROSS = tuple(name for name in PAIR if name not in ("scenario", "demand"))  # what A and B may differ in
+ACROSS = tuple(name for name in PAIR if name not in ("scenario", "demand"))  # may differ
 
 
 @dataclass(frozen=True, slots=True)

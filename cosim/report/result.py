@@ -1,4 +1,4 @@
-"""One episode's result: what its figures are called, and the run folder that keeps it."""
+"""One episode's result: the titles of its figures, and its run folder."""
 
 import json
 from collections.abc import Sequence

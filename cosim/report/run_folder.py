@@ -45,7 +45,7 @@ class Run:
 
     @property
     def planned(self) -> int | None:
-        """How many episodes the run is to have; None where the manifest does not say."""
+        """Number of planned episodes; None if missing in the manifest."""
         seeds, cells = self.manifest.get("seeds"), self.manifest.get("cells")
         if not (isinstance(seeds, list) and len(seeds) == 2 and cells):
             return None
@@ -53,15 +53,15 @@ class Run:
 
     @property
     def missing(self) -> int:
-        """How many planned episodes have no row."""
+        """Number of planned episodes without a row."""
         return max((self.planned or 0) - len(self.rows), 0)
 
     def case(self, row: Row) -> dict[str, Any]:
-        """The options asked for (`EpisodeOptions`), without policy and seed; {} where not known."""
+        """The requested options (`EpisodeOptions`), without policy and seed; {} if unknown."""
         return {k: v for k, v in self._cell(row).get("case", {}).items() if k not in ("policy", "seed")}
 
     def settings(self, row: Row) -> dict[str, Any]:
-        """Options of an episode that no column of its row has (`SETTINGS`); times in s."""
+        """Options of an episode outside of its row's columns (`SETTINGS`); times in s."""
         driven, asked = self._cell(row).get("manifest", {}), self.case(row)
         times = driven.get("timing", {})
         return {name: asked.get(option.field) for name, option in COLUMNS.items()} | {

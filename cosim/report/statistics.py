@@ -16,7 +16,7 @@ from scipy.optimize import brentq
 
 CONFIDENCE = 0.95
 Z = float(stats.norm.ppf(0.5 + CONFIDENCE / 2.0))
-RESAMPLES = 2000  # the bounds of a mean then wander by some 2 % of the interval's width from seed to seed
+RESAMPLES = 2000  # bounds of a mean then vary by some 2 % of the interval's width between seeds
 FEW_EVENTS = 3.0  # effective events, from which on their largest weight bounds that of another one
 # Effective events of two rates, and effective samples with an event, from which on the difference of the
 # rates is about normal.
@@ -29,7 +29,7 @@ Bools = Sequence[bool] | npt.NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """A value and its 95 % interval; nan where there is none."""
+    """A value and its 95 % interval; nan if missing."""
 
     value: float
     low: float
@@ -37,11 +37,11 @@ class Figure:
 
     @property
     def known(self) -> bool:
-        """Whether there is a value at all."""
+        """Whether the value is not NA."""
         return not math.isnan(self.value)
 
     def text(self, digits: int, scale: float = 1.0) -> str:
-        """`value (low to high)`; "-" for NA, the bare value where no interval can be given."""
+        """`value (low to high)`; "-" for NA, the value alone without an interval."""
         if not self.known:
             return "-"
         value, low, high = (f"{scale * x:.{digits}f}" for x in (self.value, self.low, self.high))
@@ -68,7 +68,7 @@ def share(hits: int, count: int) -> Figure:
 
 
 def rule_of_three(count: int) -> float:
-    """Upper 95 % bound of a proportion that was never seen in `count` trials: 3 / count (Hanley 1983).
+    """Upper 95 % bound of a proportion never observed in `count` trials: 3 / count (Hanley 1983).
 
     nan for 0 trials. One-sided, hence a little below Wilson's two-sided bound.
     """

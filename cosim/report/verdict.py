@@ -238,7 +238,7 @@ def _cells(figure: PairedFigure) -> tuple[_Cell, _Cell, _Cell, _Cell]:
 
 
 def _notes(compared: Compared) -> list[str]:
-    """Lines above a group's table: how many pairs, who drove, and what limits the comparison."""
+    """Lines above a group's table: number of pairs, policies, and limits of the comparison."""
     group = compared.group
     caution = " (a single pair cannot show a difference)" * (len(group.pairs) == 1)
     notes = [f"{_pairs(len(group.pairs))}{caution}, A {driver(group.a)}, B {driver(group.b)}"]

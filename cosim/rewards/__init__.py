@@ -1,4 +1,4 @@
-"""What each AV earns by a decision: the papers' rewards in one table, their weights, and a user's own."""
+"""Rewards of a decision: the papers' rewards in one table, their weights, and a user's own reward."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from cosim.types import Collision, MetaAction, Snapshot
 
 __all__ = ["REWARDS", "Reward", "RewardConfig", "RewardStep", "RewardTerms", "read", "rewards"]
 
-# name -> what makes it of its weights; `RewardConfig.variant` says which
+# name -> constructor from the weights; selected by `RewardConfig.variant`
 REWARDS: dict[str, Callable[[RewardConfig], Reward]] = {"p": RewardP, "t": RewardT}
 
 
 @dataclass(frozen=True, slots=True)
 class RewardConfig:
-    """Weights w_m of the traffic metrics x_m and what couples vehicles. Every weight multiplies a number
-    that is 0 or 1 (crash, lane change, speed change) or lies between 0 and 1 (speed, distance), once a
-    decision."""
+    """Weights w_m of the traffic metrics x_m and the coupling of vehicles. Once per decision, every weight
+    multiplies a number that is 0 or 1 (crash, lane change, speed change) or between 0 and 1 (speed,
+    distance)."""
 
     variant: str = "p"  # of `cosim.rewards.REWARDS`; "p": decays with distance; "t": r_i pays for maneuvers
     crash: float = -5.0  # for a vehicle that crashed in this decision; -5 in code of the same authors
-    speed: float = 1.0  # times speed / `REFERENCE_SPEED` at the decision's end; 1 in the same code
-    distance: float = 1.0  # times distance / (`REFERENCE_SPEED` * duration); as much as speed: P names both
+    speed: float = 1.0  # times final speed / `REFERENCE_SPEED`; 1 in the same code
+    distance: float = 1.0  # times distance / (`REFERENCE_SPEED` * duration); equal to speed: P names both
     lane_change: float = -0.3  # variant t, r_i only, for commanding one; 0.3 in the same code
     acceleration: float = -0.1  # variant t, r_i only, for Accelerate and Decelerate; less than a lane change
     eta: float = 1.0  # exponent of the distance decay (P, eq. (6)); not stated there: 1
-    mission: float = 20.0  # a mission vehicle's utility counts as this many bystanders': altruism was
-    # learned with 20 and not with 1, where its gain drowns among those who merely drive by
-    social: float = 1.0  # of every other's utility against the own: with eta = 0 twenty add up undiminished
-    perception_range: float = 125.0  # m, only neighbours an AV perceives count (ObservationConfig)
+    mission: float = 20.0  # weight of a mission vehicle's utility against a bystander's. Altruism
+    # was learned with 20 and not with 1, where bystanders dominate the sum
+    social: float = 1.0  # weight of the others' utility against the ego's: with eta = 0 twenty add up fully
+    perception_range: float = 125.0  # m, only perceived neighbours count (ObservationConfig)
 
     def __post_init__(self) -> None:
         one_of(self.variant, REWARDS, "variant")
@@ -59,11 +59,11 @@ def rewards(
     reward: Reward,
     collisions: Sequence[Collision],
 ) -> dict[str, RewardTerms]:
-    """What `reward` pays each of `avs` for the decision that led from `before` to `after`.
+    """The reward of each of `avs` for the decision from `before` to `after`.
 
     The arguments are those of `RewardStep`. A number alone counts as the AV's own part r_i and as the total.
 
-    Raises BadInput: an AV is left out or is none of `avs`, or what it is paid is no finite number.
+    Raises BadInput when an AV is missing or not one of `avs`, or a reward is no finite number.
     """
     paid = reward(RewardStep(before, after, tuple(avs), actions, svo, collisions))
     if not isinstance(paid, Mapping) or paid.keys() != set(avs):
@@ -74,11 +74,11 @@ def rewards(
 
 
 def read(what: str | Reward, field: str = "--reward") -> Reward:
-    """The reward that a text names (of `REWARDS`, FILE.py:NAME or MODULE:NAME); an object is one already.
+    """The reward of a name (in `REWARDS`, FILE.py:NAME or MODULE:NAME); objects are returned unchanged.
 
-    A class is made without arguments; a function, or another object that can be called, is the reward itself.
+    A class is constructed without arguments; a function or another callable is the reward itself.
 
-    Raises BadInput: there is no such reward, its code cannot be loaded or called.
+    Raises BadInput for an unknown reward, or code that cannot be loaded or called.
     """
     if not isinstance(what, str):
         return what

@@ -1,4 +1,4 @@
-"""What a reward is: it sees one decision of the traffic and says what each AV earned by it."""
+"""The protocol of a reward: a function from one decision of the traffic to each AV's reward."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple, Protocol
@@ -7,12 +7,12 @@ from cosim.types import Collision, MetaAction, Snapshot
 
 
 class RewardStep(NamedTuple):
-    """One decision (0.4 s) of the traffic, from the moment it was taken to the moment of the next."""
+    """One decision period (0.4 s) of the traffic."""
 
-    before: Snapshot  # every vehicle when the AVs decided
-    after: Snapshot  # when the decision's period was over; `after.events` are the last frame's only
-    avs: tuple[str, ...]  # who is to be rewarded: AVs of `before`; one that is not in `after` left the road
-    actions: Mapping[str, MetaAction]  # what the AVs were commanded; one that is left out: nothing
+    before: Snapshot  # all vehicles at the decision
+    after: Snapshot  # all vehicles at the end of the period; `after.events` are the last frame's only
+    avs: tuple[str, ...]  # AVs of `before` to be rewarded; an AV missing in `after` left the road
+    actions: Mapping[str, MetaAction]  # commands of the AVs; a missing AV had none
     svo: float  # rad, phi: 0 egoistic, pi/2 altruistic
     collisions: Sequence[Collision]  # of the whole period
 
@@ -27,7 +27,7 @@ class RewardTerms(NamedTuple):
 
 
 class Reward(Protocol):
-    """A function, or an object that can be called. It keeps nothing from one decision to the next."""
+    """A callable without state between decisions."""
 
     def __call__(self, step: RewardStep) -> Mapping[str, RewardTerms | float]:
         """The reward of each of `step.avs`: its terms, or the total alone."""

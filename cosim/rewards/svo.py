@@ -12,18 +12,18 @@ from cosim.types import Floats, Kind, MetaAction, Snapshot
 if TYPE_CHECKING:
     from cosim.rewards import RewardConfig
 
-REFERENCE_SPEED = 30.0  # m/s, where speed and distance saturate: AVs drive 25-30 m/s in the papers
-NEAREST = 5.0  # m, distances below it count as this: a vehicle's length, so that no neighbour dominates
+REFERENCE_SPEED = 30.0  # m/s, saturation of speed and distance: AVs drive 25-30 m/s in the papers
+NEAREST = 5.0  # m, minimum distance in the decay (a vehicle's length), so that no neighbour dominates
 _LANE_CHANGES = (MetaAction.LANE_LEFT, MetaAction.LANE_RIGHT)
 _SPEED_CHANGES = (MetaAction.ACCELERATE, MetaAction.DECELERATE)
 
 
 class RewardP:
-    """P, section IV-B, equation (6): what others gain counts less the farther away they are.
+    """P, section IV-B, equation (6): the others' utility decays with their distance.
 
-    Neighbours are the vehicles of both snapshots within `config.perception_range` m of the AV in `after`;
-    persons are none.
-    An AV that is no longer on the road gets its crash and nothing else.
+    Neighbours are the vehicles of both snapshots within `config.perception_range` m of the AV in `after`,
+    without persons.
+    An AV that left the road gets the reward of its crash only.
     """
 
     def __init__(self, config: RewardConfig) -> None:
@@ -56,16 +56,16 @@ class RewardP:
         return terms
 
     def decay(self, distance: Floats) -> Floats:
-        """[a,n] what a neighbour `distance` [a,n] m away counts."""
+        """[a,n] weight of a neighbour at `distance` [a,n] m."""
         return np.asarray(np.maximum(distance, NEAREST) ** -self.config.eta)
 
     def maneuver(self, action: MetaAction | None) -> float:
-        """What commanding `action` adds to r_i."""
+        """The contribution of the command `action` to r_i."""
         return 0.0
 
 
 class RewardT(RewardP):
-    """T, equation (2): neighbours count alike wherever they are, and r_i pays for maneuvers."""
+    """T, equation (2): equal weight of all neighbours, and r_i includes the cost of maneuvers."""
 
     def decay(self, distance: Floats) -> Floats:
         """[a,n] ones."""
@@ -80,7 +80,7 @@ class RewardT(RewardP):
 def vehicle_utility(before: Snapshot, after: Snapshot, crashed: set[str], config: RewardConfig) -> Floats:
     """sum_m w_m x_m of every vehicle of `after`: [n], no unit; x_m: crash, speed, distance travelled (P).
 
-    A vehicle that was not there `before` has no distance yet and counts 0, unless it crashed.
+    A vehicle missing in `before` has no distance and counts 0, unless it crashed.
     """
     then = np.array([before.row.get(name, -1) for name in after.ids], dtype=np.int64)  # [n]
     old = then >= 0

@@ -1,1 +1,1 @@
-"""What each AV knows of others: sensors, messages, tracks (docs/reference/sensing.md)."""
+"""Each AV's knowledge of other objects: sensors, messages, tracks (docs/reference/sensing.md)."""

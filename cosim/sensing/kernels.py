@@ -1,8 +1,8 @@
 """Sensors, messages and tracks of all AVs in one frame (numba kernels).
 
-`S` slots of objects (vehicles and persons), `A` slots of AVs, `T` frames in a ring buffer: frame `f` stands
-at `f % T`. SI units, rad. A frame has a whole number on the simulation's clock; every random number is a hash
-of vehicles, a purpose and that number, or a message's, so that it does not depend on who else is there.
+`S` slots of objects (vehicles and persons), `A` slots of AVs, `T` frames in a ring buffer: frame `f` is at
+index `f % T`. SI units, rad. A frame has an integer number on the simulation's clock. Every random number is
+a hash of vehicles, a purpose and a frame's or message's number: it does not depend on other vehicles.
 """
 
 import math
@@ -20,43 +20,43 @@ Rows = npt.NDArray[np.int64]
 Outlines = tuple[Rows, Floats, Floats, Floats]  # as `cosim.sensing.walls.Walls`
 Radio = tuple[float, float, float, float, float, float]  # range m, period s, delay s, jitter s, loss, burst
 
-# Of `seen`: what an AV's own sensors make of an object.
+# Values of `seen`: detection of an object by an AV's own sensors.
 OUT_OF_RANGE, HIDDEN, MISSED, DETECTED = 0, 1, 2, 3
-# Of `source`, as `cosim.types.Source`.
+# Values of `source`, as `cosim.types.Source`.
 SENSOR, CAM, CPM = 1, 2, 3
 HOLD, CONSTANT_VELOCITY, LANES, TRUTH = 0, 1, 2, 3
 # Columns of the ring of true states.
 X, Y, HEADING, SPEED, LANE, POSITION = range(6)
 STATES = 6
-# Columns of a track: time (s, nan: none), x, y (m), velocity (m/s), heading (rad), variances of a coordinate,
-# of it with its speed, of that speed, of the heading; last measurement accepted (s), lane, front bumper on
-# it (m), source, detections, acceleration (m/s2), time of the newest CAM (s), whether it sent one.
+# Columns of a track: time (s, nan: none), x, y (m), velocity (m/s), heading (rad), variance of a coordinate,
+# its covariance with speed, variances of speed and heading; last accepted measurement (s), lane, front bumper
+# on it (m), source, detections, acceleration (m/s2), time of the newest CAM (s), whether a CAM was received.
 T_TIME, T_X, T_Y, T_VX, T_VY, T_HEADING, T_XX, T_XV, T_VV, T_HH, T_ACCEPTED, T_LANE, T_POSITION = range(13)
 T_SOURCE, T_HITS, T_ACCEL, T_CAM, T_TOLD = range(13, 18)
 TRACK = 18
-# Columns of a belief: the state that an AV takes an object to have now, its age (s), source (`OWN`:
-# the AV itself) and whether it has sent a CAM.
+# Columns of a belief: an object's present state as estimated by an AV, its age (s), source (`OWN`: the AV
+# itself) and whether a CAM was received.
 B_X, B_Y, B_HEADING, B_SPEED, B_ACCEL, B_LANE, B_POSITION, B_AGE, B_SOURCE, B_TOLD = range(10)
 BELIEF = 10
 OWN = -1.0
 
-BINS = 720  # directions of the line of sight, half a degree each
+BINS = 720  # number of directions of the line of sight, half a degree each
 BIN = 2.0 * math.pi / BINS  # rad
 _COS, _SIN = np.cos((np.arange(BINS) + 0.5) * BIN), np.sin((np.arange(BINS) + 0.5) * BIN)
-TOUCH = 0.05  # m by which two distances in one direction must differ
+TOUCH = 0.05  # m, minimum difference of two distances in one direction
 ACCELERATION_NOISE = 4.0  # m2/s3, spectral density of the constant-velocity model: (2 m/s2)^2 over 1 s
-TURN_NOISE = 0.05  # rad2/s, the same of a heading that stays: 0.22 rad in 1 s
-GATE = 18.47  # chi-squared with 4 degrees of freedom, 99.9 %: beyond it a track begins anew
+TURN_NOISE = 0.05  # rad2/s, spectral density of the constant-heading model: 0.22 rad in 1 s
+GATE = 18.47  # chi-squared with 4 degrees of freedom, 99.9 %: beyond it a track is reinitialised
 LEAST_VARIANCE = 1e-6  # of a measurement without noise
-SMOOTHING = 0.5  # of the newest in an acceleration
-FURTHEST_BACK = 100_000  # messages that a channel's state is looked up in: none is so far by chance
+SMOOTHING = 0.5  # weight of the newest value in the smoothed acceleration
+FURTHEST_BACK = 100_000  # messages, search limit for a channel's state, never reached in practice
 
 _GOLD = np.uint64(0x9E3779B97F4A7C15)
 _M1, _M2 = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 _30, _27, _31, _11 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(11)
 _ONE = np.uint64(1)
-# Purposes of draws: detection, noise of own sensors (six), of a sender (six), phase of its messages; of each
-# kind of message its loss and delay.
+# Purposes of draws: detection, noise of own sensors (six), of a sender (six), phase of its messages; loss and
+# delay of each kind of message.
 _DETECTS, _NOISE, _STATES, _PHASE = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4)
 _LOSS, _DELAY = np.uint64(16), np.uint64(32)
 CAM_KIND, CPM_KIND, MCM_KIND = np.uint64(1), np.uint64(2), np.uint64(3)
@@ -74,7 +74,7 @@ def _mixed(z: np.uint64) -> np.uint64:
 
 @compiled
 def stream_of(first: np.uint64, second: np.uint64, purpose: np.uint64) -> np.uint64:
-    """The stream of a purpose of two vehicles, in this order."""
+    """The random stream of an ordered pair of vehicles for a purpose."""
     return _mixed(first + _mixed(second + purpose * _GOLD))
 
 
@@ -93,13 +93,13 @@ def normal(stream: np.uint64, number: int) -> float:
 
 @compiled
 def lost(stream: np.uint64, number: int, loss: float, burst: float) -> bool:
-    """Whether message `number` of a channel is lost: Gilbert's two states, where the bad one loses all.
+    """Whether message `number` of a channel is lost (Gilbert's two-state model; the bad state loses all).
 
-    A draw below the probability to become bad makes the state bad whatever it was, one above that to stay
-    bad makes it good: so the state follows from the newest such draw, without the ones before it.
+    A draw below the probability of becoming bad makes the state bad from either state; a draw above the
+    probability of staying bad makes it good. The state therefore follows from the newest such draw alone.
 
     Args:
-        loss: share of all messages that are lost.
+        loss: share of lost messages.
         burst: mean length of a run of losses; at least 1 / (1 - loss).
     """
     if loss <= 0.0:
@@ -127,7 +127,7 @@ def newest_message(
     loss: float,
     burst: float,
 ) -> tuple[float, int]:
-    """The time (s) and the number of the newest message of one kind that has arrived; (-1, 0): none."""
+    """Time (s) and number of the newest arrived message of one kind; (-1, 0): none."""
     phase = draw(stream_of(sender, sender, _PHASE + kind), 0)
     number = math.floor(now / period - phase + 1e-9)
     channel = stream_of(sender, receiver, _LOSS + kind)
@@ -150,7 +150,7 @@ def newest_message(
 
 @compiled
 def _entry(dx: float, dy: float, ux: float, uy: float, c: float, s: float, half: float, side: float) -> float:
-    """m along the direction (ux, uy) to a box whose centre lies at (dx, dy); inf where it misses the box."""
+    """m along the direction (ux, uy) to a box with its centre at (dx, dy); inf if it misses the box."""
     ox, oy = -(c * dx + s * dy), s * dx - c * dy  # the origin in the box's frame
     vx, vy = c * ux + s * uy, c * uy - s * ux
     near, far = 0.0, np.inf
@@ -171,7 +171,7 @@ def _entry(dx: float, dy: float, ux: float, uy: float, c: float, s: float, half:
 
 @compiled
 def _spread(dx: float, dy: float, c: float, s: float, half: float, side: float) -> tuple[float, float]:
-    """The directions (rad) in which a box lies: about its centre's, from the least to the most."""
+    """Smallest and largest direction (rad) of a box, relative to its centre's direction."""
     middle = math.atan2(dy, dx)
     low, high = 0.0, 0.0
     for along in (-half, half):
@@ -185,7 +185,7 @@ def _spread(dx: float, dy: float, c: float, s: float, half: float, side: float) 
 
 @compiled
 def _within(points: Floats, first: int, last: int, x: float, y: float) -> bool:
-    """Whether a place (m) lies in the polygon of the points `first` to `last`, which are the same one."""
+    """Whether a point (m) is inside the closed polygon of the points `first` to `last`."""
     inside = False
     for k in range(first, last):
         ax, ay, bx, by = points[k, 0], points[k, 1], points[k + 1, 0], points[k + 1, 1]
@@ -198,7 +198,7 @@ def _within(points: Floats, first: int, last: int, x: float, y: float) -> bool:
 def _behind_walls(walls: Outlines, x0: float, y0: float, reach: float, depth: Floats) -> None:
     """Lower `depth` [BINS] (m) to the nearest wall in each direction from (x0, y0); `reach` in m.
 
-    A building around that place hides nothing: a car drives under it, or the polygon is wrong.
+    A building around (x0, y0) hides nothing: the car is below it, or the polygon is wrong.
     """
     begin, points, centre, radius = walls
     for b in range(radius.shape[0]):
@@ -230,7 +230,7 @@ def detect(
     state: Floats,  # [S,6] true states, x nan where absent
     length: Floats,  # [S] m
     width: Floats,  # [S] m
-    hides: Flags,  # [S] whether its body hides what is behind it
+    hides: Flags,  # [S] whether the body hides objects behind it
     egos: Rows,  # [A] slot of each AV, -1: none
     streams: Streams,  # [S]
     step: int,  # the frame's number on the clock
@@ -243,7 +243,7 @@ def detect(
     seen: Flags,  # [A,S] out
     found: Lists,  # [A,S] out: the slots that are DETECTED, then -1
 ) -> None:
-    """What own sensors make of every object in this frame."""
+    """Detection of every object by own sensors in this frame."""
     slots = state.shape[0]
     depth = np.empty(BINS)  # m to the nearest body in each direction
     for a in range(egos.shape[0]):
@@ -295,7 +295,7 @@ def detect(
 def _in_sight(
     depth: Floats, dx: float, dy: float, heading: float, length: float, width: float, share: float
 ) -> bool:
-    """Whether so great a share of a box's angular width is in front of everybody else."""
+    """Whether the given share of a box's angular width is unobstructed."""
     c, s = math.cos(heading), math.sin(heading)
     half, side = 0.5 * length, 0.5 * width
     low, high = _spread(dx, dy, c, s, half, side)
@@ -329,8 +329,8 @@ def _update(
     heading_variance: float,  # rad2
     source: int,
 ) -> None:
-    """A constant-velocity Kalman filter's step, one for both coordinates, whose variances are equal; the
-    heading has one of its own. Who leaves the gate begins anew."""
+    """One step of a constant-velocity Kalman filter, shared by both coordinates (equal variances), and of the
+    heading's filter. A measurement outside the gate reinitialises the track."""
     dt = time - track[T_TIME]
     vx, vy = speed * math.cos(heading), speed * math.sin(heading)
     r_x = max(position_variance, LEAST_VARIANCE)
@@ -375,7 +375,7 @@ def _update(
 
 @compiled
 def _between(ring: Floats, at: float, newest: int, held: int, slot: int, out: Floats) -> bool:
-    """The true state of a slot `at` frames after the newest one (below 0: before); False: not known."""
+    """The true state of a slot `at` frames after the newest (negative: before); False if unknown."""
     size = ring.shape[0]
     first = math.floor(at + 1e-6)
     if first < 1 - held or first > 0:
@@ -397,7 +397,7 @@ def _between(ring: Floats, at: float, newest: int, held: int, slot: int, out: Fl
     out[HEADING] = before[HEADING] + share * turn
     if after[LANE] == before[LANE]:
         out[POSITION] = before[POSITION] + share * (after[POSITION] - before[POSITION])
-    else:  # on the lane before: `believe` goes on to the next one
+    else:  # on the earlier lane: `believe` advances to the next lane
         out[POSITION] = before[POSITION] + math.hypot(out[X] - before[X], out[Y] - before[Y])
     return True
 
@@ -406,31 +406,31 @@ def _between(ring: Floats, at: float, newest: int, held: int, slot: int, out: Fl
 def follow(
     ring: Floats,  # [T,S,6]
     seen: Flags,  # [T,A,S]
-    found: Lists,  # [T,A,S] as of `detect`; a slot whose object has left since is not DETECTED in `seen`
-    newest: int,  # the frame that is in the rings last
-    held: int,  # frames that are in them
+    found: Lists,  # [T,A,S] from `detect`; slots of objects that left are not DETECTED in `seen`
+    newest: int,  # newest frame in the rings
+    held: int,  # number of frames in the rings
     egos: Rows,  # [A]
     equipped: Flags,  # [S] whether it sends CAMs
     streams: Streams,  # [S]
     step: int,
     now: float,  # s
     frame: float,  # s between frames
-    lag: int,  # frames until own measurements are there
+    lag: int,  # frames of delay of own measurements
     noise: Floats,  # [3] of own sensors: m, m/s, rad
-    contents: Flags,  # [2] whether CAMs and CPMs are sent
+    contents: Flags,  # [2] CAMs enabled, CPMs enabled
     radio: Radio,
     sender_noise: Floats,  # [3]
     tracks: Floats,  # [A,S,18] in and out
     heard: Floats,  # [A,A] time of the newest CPM of each sender, in and out
 ) -> None:
-    """Every AV's tracks after this frame's measurements: of each object the newest one is taken."""
+    """Update every AV's tracks with the newest measurement of each object in this frame."""
     size, slots = ring.shape[0], ring.shape[1]
     best = np.empty(slots)  # s, time of the newest measurement
     source = np.empty(slots, np.int64)
-    whose = np.empty(slots, np.int64)  # slot of the vehicle that measured it; of a CAM the message's number
+    whose = np.empty(slots, np.int64)  # slot of the measuring vehicle; for a CAM the message's number
     truth = np.empty(STATES)
     reach, period, delay, jitter, loss, burst = radio
-    oldest = now - (held - 1) * frame - 1e-6  # s: of earlier ones the state is not known any more
+    oldest = now - (held - 1) * frame - 1e-6  # s: earlier states are no longer in the rings
     for a in range(egos.shape[0]):
         ego = egos[a]
         if ego < 0:
@@ -528,11 +528,11 @@ def intentions_heard(
     egos: Rows,  # [A]
     streams: Streams,  # [S]
     now: float,  # s
-    decision: float,  # s in which an intention must arrive
+    decision: float,  # s, deadline for an intention
     radio: Radio,
     heard: Flags,  # [A,A] out
 ) -> None:
-    """Whether each AV hears what each other one intends now: its newest MCM arrives in time."""
+    """Whether each AV receives each other AV's present intention: its newest MCM arrives in time."""
     reach, period, delay, jitter, loss, burst = radio
     heard[:] = 0
     for a in range(egos.shape[0]):
@@ -559,7 +559,7 @@ def intentions_heard(
 def _on_lane(
     begin: Rows, points: Floats, scale: Floats, lane: int, position: float
 ) -> tuple[float, float, float]:
-    """x, y (m) and heading (rad) at a position (m, SUMO's) of a lane; beyond its ends straight on."""
+    """x, y (m) and heading (rad) at a position (m, SUMO's) of a lane; straight beyond its ends."""
     first, last = begin[lane], begin[lane + 1] - 1
     arc = position * scale[lane]
     k = first
@@ -573,7 +573,7 @@ def _on_lane(
 
 @compiled
 def _drive_on(following: Rows, length: Floats, lane: int, position: float) -> tuple[int, float]:
-    """The lane and the position (m) on it where one is who drives on straight beyond the end of `lane`."""
+    """Lane and position (m) of a vehicle after it drove straight on beyond the end of `lane`."""
     while position > length[lane] and following[lane] >= 0:
         position -= length[lane]
         lane = following[lane]
@@ -582,7 +582,7 @@ def _drive_on(following: Rows, length: Floats, lane: int, position: float) -> tu
 
 @compiled
 def drive_on(following: Rows, length: Floats, lane: Rows, position: Floats) -> None:
-    """`lane` and `position` (m) of many, in place: see `_drive_on`."""
+    """`_drive_on` in place for arrays of `lane` and `position` (m)."""
     for k in range(lane.shape[0]):
         if lane[k] >= 0:
             lane[k], position[k] = _drive_on(following, length, lane[k], position[k])
@@ -591,11 +591,11 @@ def drive_on(following: Rows, length: Floats, lane: Rows, position: Floats) -> N
 @compiled
 def resample(
     time: Floats,  # [V,N] s of each measurement, in order; nan: none
-    state: Floats,  # [V,N,C] its columns
+    state: Floats,  # [V,N,C] columns of each measurement
     frame: float,  # s
-    out: Floats,  # [V,N,C] `frame` s apart, the last as it is; nan where nothing is known
+    out: Floats,  # [V,N,C] `frame` s apart, the last unchanged; nan where unknown
 ) -> None:
-    """Series of measurements that came when they came, at equal intervals: in between, straight lines."""
+    """Irregular series of measurements, resampled at equal intervals by linear interpolation."""
     frames = time.shape[1]
     for v in range(time.shape[0]):
         out[v] = np.nan
@@ -626,17 +626,17 @@ def believe(
     confirm: int,
     forget: float,  # s
     compensation: int,
-    begin: Rows,  # [l+1] where each lane's points begin
+    begin: Rows,  # [l+1] first point of each lane
     points: Floats,  # [p,3] x m, y m, m along the lane
     scale: Floats,  # [l] m along the centre line per SUMO's m
     following: Rows,  # [l]
     lane_length: Floats,  # [l] m
-    tracks: Floats,  # [A,S,18] in and out: those that ended are cleared
-    first: Rows,  # [A+1] out: where the M beliefs of each AV begin
-    slot: Rows,  # [A*S] out, the first M: whom they are about; of one AV ascending
+    tracks: Floats,  # [A,S,18] in and out: ended tracks are cleared
+    first: Rows,  # [A+1] out: first of the M beliefs of each AV
+    slot: Rows,  # [A*S] out, the first M: slot of the object; ascending for one AV
     beliefs: Floats,  # [A*S,10] out, the first M
 ) -> None:
-    """What every AV takes everybody's present state to be; it knows its own (but for the acceleration: 0)."""
+    """Every AV's belief about the present state of all objects; its own state is exact, acceleration 0."""
     many = 0
     for a in range(egos.shape[0]):
         first[a] = many
@@ -699,9 +699,9 @@ def arrange(
     first: Rows,  # [A+1], [M] and [M,10] of `believe`
     slot: Rows,
     beliefs: Floats,
-    place: Rows,  # [k] of S slots, in the order that is wanted
+    place: Rows,  # [k] of S slots, in the wanted order
     slots: int,  # S
-    rows: Rows,  # [M] out: which of the k each belief is about
+    rows: Rows,  # [M] out: index among the k of each belief's object
     columns: Floats,  # [10,M] out
 ) -> None:
     """The beliefs of each AV in the order of `place`."""

@@ -1,4 +1,4 @@
-"""The lanes of a road as flat arrays, for kernels that drive along them."""
+"""The lanes of a road as flat arrays for kernels."""
 
 from typing import NamedTuple
 
@@ -9,17 +9,17 @@ from cosim.road import RoadMap
 
 
 class LaneLines(NamedTuple):
-    """Centre lines of the l lanes of `RoadMap.lanes`, one after the other, and which lane follows which."""
+    """Concatenated centre lines of the l lanes of `RoadMap.lanes`, and their successors."""
 
-    begin: Ints  # [l+1] where each lane's points begin
+    begin: Ints  # [l+1] first point of each lane
     points: Floats  # [p,3] x m, y m, m along the lane
     scale: Floats  # [l] m along the centre line per m of SUMO's lane positions
-    following: Ints  # [l] -1 at the end
+    following: Ints  # [l] successor lane, -1: none
     length: Floats  # [l] m, SUMO's
 
 
 def lane_lines(road: RoadMap) -> LaneLines:
-    """The lanes of `road`; one drives on to the straightest successor, as its route is not known."""
+    """The lanes of `road`; the successor is the straightest, because routes are unknown."""
     lines = []
     for lane in road.lanes:
         steps = np.hypot(*np.diff(lane.shape[:, :2], axis=0).T)

@@ -1,7 +1,7 @@
 """The sensors, the radio and the tracker of every AV: snapshots in, percepts out.
 
-A track is found by the vehicle's id, for own sensors too: ids follow a vehicle through the whole observation,
-and a wrong association would be an error of a kind of its own, which no parameter asks for.
+Measurements are associated with tracks by the vehicle's id, for own sensors too. Association errors are not
+modelled.
 """
 
 import math
@@ -34,15 +34,15 @@ from cosim.sensing.walls import walls
 from cosim.types import HEADING, Actor, Compensator, Kind, Percept, Snapshot, Source, Timing, Tracks, X, Y
 
 COMPENSATION = {"hold": 0, "cv": 1, "lanes": 2, "truth": 3, "gp": 0, "hpn": 0}  # the kernels' part of it
-PREDICTED = ("gp", "hpn")  # what a `Compensator` is needed for
-STATE = [B_X, B_Y, B_SPEED, B_HEADING]  # of a belief, as a `Compensator` has it
-PAST = [B_AGE, *STATE]  # of a belief, kept for a `Compensator`: with the time in place of the age
-HIDING = (Actor.CAR, Actor.TRUCK, Actor.BUS, Actor.OTHER)  # nobody is behind a motorcycle or a person
-LONGEST_JITTER = 6.0  # of its mean: one message in 400 comes later, and is not looked at
+PREDICTED = ("gp", "hpn")  # compensations with a `Compensator`
+STATE = [B_X, B_Y, B_SPEED, B_HEADING]  # columns of a belief for a `Compensator`
+PAST = [B_AGE, *STATE]  # columns kept for a `Compensator`, with the time in place of the age
+HIDING = (Actor.CAR, Actor.TRUCK, Actor.BUS, Actor.OTHER)  # motorcycles and persons hide nothing
+LONGEST_JITTER = 6.0  # times the mean jitter: one message in 400 is later and is ignored
 NOBODY: frozenset[str] = frozenset()
-AV, HV, PERSON = int(Kind.AV), int(Kind.HV), int(Kind.PERSON)  # members of an enum cost time
+AV, HV, PERSON = int(Kind.AV), int(Kind.HV), int(Kind.PERSON)  # plain ints: enum members are slow
 TRUTH = int(Source.TRUTH)
-SLOTS = 64  # objects that there is room for at first; AVs: a quarter
+SLOTS = 64  # initial capacity in objects; AVs: a quarter
 
 
 class Perception:
@@ -52,9 +52,9 @@ class Perception:
         road: the net.
         parameters: the level.
         timing: the clocks.
-        seed: the episode's, from which every draw comes.
+        seed: of the episode and of every draw.
         compensator: for the compensations of `PREDICTED`.
-        buildings: outlines [.,2] (m) that hide what is behind them, where there is a line of sight.
+        buildings: outlines [.,2] (m) that obstruct the line of sight.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class Perception:
         self._slots = _Slots(self._lag + math.ceil(oldest / timing.frame) + 3, past)
 
     def perceive(self, snapshot: Snapshot) -> Mapping[str, Percept]:
-        """What every AV of the next frame knows."""
+        """The percepts of every AV in the next frame."""
         p, slots, now = self._parameters, self._slots, snapshot.time
         rows = slots.settle(snapshot, self._stream, self._is_equipped)
         self._newest += 1
@@ -149,7 +149,7 @@ class Perception:
         beliefs[known[late]] = then
 
     def _own_then(self, beliefs: Floats) -> Floats:
-        """The same [M,10] with each AV's own state at the mean age of what it knows, in whole frames."""
+        """`beliefs` [M,10] with each AV's own state at the mean age of its beliefs, in whole frames."""
         ring, frame, result = self._slots.ring, self._timing.frame, beliefs.copy()
         for a, e in enumerate(self._slots.egos):
             if e < 0:
@@ -175,7 +175,7 @@ class Perception:
 
 
 class Known(NamedTuple):
-    """What does not change of the objects that hold a place: k of them, by name."""
+    """Constant properties of the k objects with a slot, by name."""
 
     names: tuple[str, ...]
     place: Ints  # [k]
@@ -187,7 +187,7 @@ class Known(NamedTuple):
 
 
 class Percepts(Mapping[str, Percept]):
-    """AV -> what it knows at one frame, put together when it is asked for."""
+    """AV -> its percept at one frame, built on access."""
 
     def __init__(
         self,
@@ -207,7 +207,7 @@ class Percepts(Mapping[str, Percept]):
         self._names = {a: name for name, a in slots.avs.items()}
         self._ids = [*map(known.names.__getitem__, rows.tolist())]
         self._kind, self._actor = known.kind[rows], known.actor[rows]
-        self._kind[(self._kind == AV) & (columns[B_TOLD] == 0.0)] = HV  # it has not said what it is
+        self._kind[(self._kind == AV) & (columns[B_TOLD] == 0.0)] = HV  # unknown as an AV without a CAM
         self._length, self._width, self._mission = known.length[rows], known.width[rows], known.mission[rows]
         self._lane = columns[B_LANE].astype(np.int32)
         self._source = np.maximum(columns[B_SOURCE], TRUTH).astype(np.int8)  # OWN is the truth
@@ -278,10 +278,10 @@ def _tracks(slots: "_Slots", owner: Ints, place: Ints, then: Floats, frame: floa
 
 
 class _Slots:
-    """Places of objects and AVs in the arrays; an object keeps its place while somebody tracks it."""
+    """Slots of objects and AVs in the arrays; an object keeps its slot while any AV tracks it."""
 
     def __init__(self, frames: int, past: int) -> None:
-        self._past = past  # frames of beliefs that a `Compensator` needs
+        self._past = past  # frames of beliefs for a `Compensator`
         self.names: list[str] = [""] * SLOTS  # "": free
         self.place: dict[str, int] = {}
         self.avs: dict[str, int] = {}
@@ -307,7 +307,7 @@ class _Slots:
         self.streams = np.zeros(objects, np.uint64)
 
     def settle(self, s: Snapshot, stream: Callable[[str], int], is_equipped: Callable[[str], bool]) -> Ints:
-        """The places [n] of the n vehicles and persons of the next frame."""
+        """The slots [n] of the n vehicles and persons of the next frame."""
         if s.ids != self._ids or s.avs != tuple(self.avs):
             self._change(s, stream, is_equipped)
         if not np.array_equal(self.mission[self._rows], s.mission):
@@ -317,7 +317,7 @@ class _Slots:
 
     def _change(self, s: Snapshot, stream: Callable[[str], int], is_equipped: Callable[[str], bool]) -> None:
         avs = set(s.avs)
-        for name in [name for name in self.avs if name not in avs]:  # or one that is no AV any more
+        for name in [name for name in self.avs if name not in avs]:  # left, or no longer an AV
             self.egos[self.avs.pop(name)] = -1
         for name in [name for name in self.place if name not in s.row]:
             k = self.place[name]
@@ -362,7 +362,7 @@ class _Slots:
         self.tracks[:, k] = _no_tracks(1, 1)[0, 0]
 
     def _equip(self, name: str) -> None:
-        """A vehicle is an AV from now on."""
+        """Register a vehicle as an AV."""
         free = np.flatnonzero(self.egos < 0)
         if not len(free):
             free = np.array([len(self.egos)])

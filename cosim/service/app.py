@@ -1,4 +1,4 @@
-"""The server's application: its parts, its routes, and one form for whatever goes wrong."""
+"""The server's application: its parts, its routes, and one form of error answers."""
 
 import contextlib
 import errno
@@ -135,7 +135,7 @@ def create(settings: Settings) -> FastAPI:
 
 
 def _answer_problems(app: FastAPI, settings: Settings) -> None:
-    """Whatever is raised becomes a `Problem`."""
+    """Convert every exception into a `Problem`."""
 
     def answer(
         status: int, problem: str, field: str | None = None, value: Any = None, file: Any = None
@@ -212,7 +212,7 @@ def _workers(runs: Runs, warmth: Warmth) -> Check:
 
 
 def _about(figures: Figures, ready: Readiness, reads: Lane) -> APIRouter:
-    """What the server is and has."""
+    """The state of the server."""
     router = APIRouter(tags=["server"])
     uploads = not lacking()
 

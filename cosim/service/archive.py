@@ -1,4 +1,4 @@
-"""Unpack a zip file that somebody sent: regular files with plain names, counted while written."""
+"""Unpacking of an uploaded zip file: regular files with plain names, with size limits while writing."""
 
 import gzip
 import stat
@@ -94,7 +94,7 @@ def _name(entry: zipfile.ZipInfo, suffixes: tuple[str, ...]) -> str:
 
 
 def _counted(source: IO[bytes] | gzip.GzipFile, most: int, limits: Limits) -> Iterator[bytes]:
-    """What is read there. Raises BadInput behind `most` bytes, whatever the archive says of its sizes."""
+    """Read with a limit. Raises BadInput beyond `most` bytes, regardless of sizes declared in the archive."""
     total = 0
     while chunk := source.read(CHUNK):
         total += len(chunk)
@@ -104,7 +104,7 @@ def _counted(source: IO[bytes] | gzip.GzipFile, most: int, limits: Limits) -> It
 
 
 def _held(path: Path, name: str, most: int, limits: Limits) -> Iterator[bytes]:
-    """What a gzip file holds; nothing for another one."""
+    """The content of a gzip file; empty for another file."""
     with path.open("rb") as raw:
         if raw.read(len(GZIP_MAGIC)) != GZIP_MAGIC:
             return

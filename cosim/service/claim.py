@@ -1,7 +1,7 @@
-"""Which server drives the runs of a PostgreSQL database: one at a time, however connections come and go.
+"""Exclusive ownership of a PostgreSQL database's runs: one server at a time, across reconnections.
 
-A lock of PostgreSQL's says who may drive; it is gone as soon as the connection is that took it. The row of
-`cosim_claim` names the last server that held it: whoever writes as another one is refused.
+A PostgreSQL lock, released with its connection, permits driving. The row of `cosim_claim` names the last
+server that held the lock; writes of another server are refused.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from cosim.service.ids import new_id
 from cosim.service.problems import Refused
 
 LOCK = int.from_bytes(b"cosim")  # PostgreSQL's number of it
-CLAIMING = 5.0  # s that the database may take to notice the end of a server that was killed
-LOOKS = 1.0  # s between looks whether the lock is still held
-STOPPING = 5.0  # s that a server without the lock may take to look and to stop
+CLAIMING = 5.0  # s until the database notices a killed server
+LOOKS = 1.0  # s between checks of the lock
+STOPPING = 5.0  # s until a server without the lock notices and stops
 
 _claims = sa.Table(
     "cosim_claim",
     sa.MetaData(),
     sa.Column("lock", sa.BigInteger, primary_key=True, autoincrement=False),
-    sa.Column("server", sa.String(32)),  # None: the last one ended in order
+    sa.Column("server", sa.String(32)),  # None: the last server shut down properly
 )
 
 
@@ -42,8 +42,8 @@ class Claim:
     def __init__(self, engine: sa.Engine, url: str) -> None:
         self._engine, self._name = engine, new_id()
         self._connection: sa.Connection | None = None
-        self._term = 0  # how often it was taken from another server
-        self.drives_from = 0.0  # time.monotonic() from which nobody else drives any more
+        self._term = 0  # number of takeovers from another server
+        self.drives_from = 0.0  # time.monotonic() from which no other server drives any more
         _claims.create(engine, checkfirst=True)
         deadline = time.monotonic() + CLAIMING
         while not self.take():
@@ -52,7 +52,7 @@ class Claim:
             time.sleep(0.1)
 
     def take(self) -> bool:
-        """Whether this server has the lock now, where nobody else has it. Raises SQLAlchemyError."""
+        """Try to take the lock; whether this server has it now. Raises SQLAlchemyError."""
         connection = self._engine.connect().execution_options(isolation_level="AUTOCOMMIT")
         try:
             if not connection.execute(sa.select(sa.func.pg_try_advisory_lock(LOCK))).scalar_one():
@@ -87,7 +87,7 @@ class Claim:
 
     @property
     def held(self) -> bool:
-        """Whether the lock was this server's when it was last looked."""
+        """Whether this server had the lock at the last check."""
         return self._connection is not None
 
     def check(self, connection: sa.Connection) -> None:
@@ -99,7 +99,7 @@ class Claim:
             raise Superseded("another server drives the runs of this database")
 
     def close(self) -> None:
-        """Leave it to another server."""
+        """Release the database to another server."""
         if self._connection is not None:
             with contextlib.suppress(SQLAlchemyError):
                 self._note(self._connection, None)
@@ -108,7 +108,7 @@ class Claim:
     # ---- inside ----
 
     def _noted(self, connection: sa.Connection) -> str | None:
-        """The server that the row names; nobody changes it before the transaction ends."""
+        """The server named in the row, which is locked until the transaction ends."""
         query = sa.select(_claims.c.server).where(_claims.c.lock == LOCK).with_for_update(read=True)
         found: str | None = connection.execute(query).scalar()
         return found

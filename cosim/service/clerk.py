@@ -1,4 +1,4 @@
-"""Plans, tables and reports, in processes of their own: no request keeps the server from answering."""
+"""Plans, tables and reports in separate processes, so that no request blocks the server."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class Clerk(Planner):
 
 
 class Clerks:
-    """Processes that each host a `Clerk`; whoever asks waits for a free one.
+    """Processes that each host a `Clerk`; callers wait for a free one.
 
     An upload is read by a confined process in place of a clerk, which is not reused.
 
@@ -105,7 +105,7 @@ class Clerks:
         return self._planned("plan_again", cases, seeds, uploads)
 
     def session(self, flags: Mapping[str, Any], uploads: Sequence[str]) -> tuple[Scenario, EpisodeOptions]:
-        """What a session is opened on."""
+        """The scenario of a session."""
         (case,), _ = self.call("asked", flags)
         scenario: Scenario = self._read(uploads, "session", case)
         return scenario, case
@@ -138,7 +138,7 @@ class Clerks:
     def _planned(
         self, method: str, cases: Sequence[EpisodeOptions], seeds: range, uploads: Sequence[str]
     ) -> Plan:
-        """A plan of these very cases, whatever the process that read the files says of them."""
+        """A plan checked against the requested cases: the confined process is not trusted."""
         found: Plan = self._read(uploads, method, cases, seeds)
         cells = zip(found.cells, cases, strict=True)
         return Plan(tuple(replace(cell, case=case) for cell, case in cells), seeds)
@@ -147,7 +147,7 @@ class Clerks:
         """One method of a `Planner`, confined where there are uploads."""
         if not uploads:
             return self.call(method, *arguments)
-        k = self._free.get()  # no more at once than there are clerks
+        k = self._free.get()  # at most one call per clerk
         try:
             with room(self._settings, uploads) as confined:
                 planner = confined_planner, confined

@@ -1,4 +1,4 @@
-"""Drive a session of a server as if `cosim.open` had opened it: the same object, the simulation elsewhere.
+"""A session on a server, with the interface of `cosim.open`.
 
     from cosim.service import client
 
@@ -96,7 +96,7 @@ class Remote(Session):
 
 
 class Connection:
-    """One kept-alive connection to a server. Raises BadInput: `url` is none, nobody answers there."""
+    """One kept-alive connection to a server. Raises BadInput for an invalid `url` or without an answer."""
 
     def __init__(self, url: str, token: str | None, timeout: float) -> None:
         parts = urlsplit(url)
@@ -138,12 +138,12 @@ class Connection:
         return answer.headers.get_content_type(), data
 
     def close(self) -> None:
-        """End it."""
+        """Close the connection."""
         self._connection.close()
 
 
 class _Caller:
-    """What a session asks of its worker, asked of the server."""
+    """The session's `Caller`: requests to the server in place of a worker."""
 
     def __init__(self, connection: Connection, request: Mapping[str, Any]) -> None:
         self._connection = connection
@@ -192,7 +192,7 @@ class _Caller:
 
 
 def _problem(status: int, data: bytes, url: str) -> CosimError:
-    """What a server's refusal is raised as."""
+    """The exception for a server's refusal."""
     try:
         found = json.loads(data)
         problem, field, value, file = (found[name] for name in ("problem", "field", "value", "file"))

@@ -5,7 +5,7 @@ resources are limited, and root is not root in it. It is started without the ser
 answers is read as plain data (`cosim.workers.untrusted`).
 
 Nothing of the simulation is imported before the process is confined: numba settles on its cache when it is
-imported, and gets a copy of its own, which nobody else ever reads.
+imported, and gets its own copy, which no other process reads.
 """
 
 from __future__ import annotations
@@ -55,10 +55,10 @@ _NUMBA = "NUMBA_CACHE_DIR"
 
 @dataclass(frozen=True, slots=True)
 class Room:
-    """What a confined process may touch, and how much it may use."""
+    """Files and resources allowed to a confined process."""
 
-    scratch: str  # a folder for its own temporary files; whoever confines it removes it
-    reads: tuple[str, ...] = ()  # beside the system's folders and those that Python imports from
+    scratch: str  # folder of its temporary files, removed by the caller
+    reads: tuple[str, ...] = ()  # readable besides the system's folders and Python's import folders
     writes: tuple[str, ...] = ()
     limits: Limits = Limits()
 
@@ -66,7 +66,7 @@ class Room:
         """Confine this process, for good. Raises CosimError where `lacking` says something."""
         if problem := lacking():
             raise CosimError(problem)
-        os.dup2(2, 1)  # which is the server's
+        os.dup2(2, 1)  # stdout belongs to the server
         privileges.drop((self.scratch, *self.writes))
         with cannot("make a folder there as an ordinary user", file=self.scratch):
             scratch = tempfile.tempdir = tempfile.mkdtemp(prefix=disk.folder_prefix(), dir=self.scratch)
@@ -92,7 +92,7 @@ class Room:
 
 
 def lacking() -> str:
-    """Why uploads cannot be confined here; empty where they can."""
+    """The reason why uploads cannot be confined here; empty if they can."""
     if not landlock.version():
         return "this kernel has no Landlock to confine uploads"
     if not seccomp.available():
@@ -206,7 +206,7 @@ class Drawer:
 
 @untrusted
 class Examiner:
-    """Takes an upload in a confined process: whatever happens there, the server goes on."""
+    """Examines an upload in a confined process, so that faults there do not affect the server."""
 
     def __init__(self, room: Room) -> None:
         self._limits = room.limits
@@ -231,7 +231,7 @@ class Examiner:
         return str(main.relative_to(place)), self.scenario(str(main))
 
     def scenario(self, config: str) -> dict[str, Any]:
-        """What a .sumocfg holds. Raises BadInput as `cosim.scenario.vet.vet`, and what SUMO refuses."""
+        """The description of a .sumocfg. Raises BadInput as `cosim.scenario.vet.vet`, or SUMO's refusal."""
         from cosim.host import sumo
         from cosim.scenario import load
         from cosim.scenario.vet import vet
@@ -250,7 +250,7 @@ class Examiner:
         }
 
     def policy(self, weights: str) -> dict[str, Any]:
-        """What agent the weights are of. Raises BadInput where they do not fit their card."""
+        """The agent of the weights. Raises BadInput if they do not fit their card."""
         from cosim.policies import make
 
         with _memory_is_limited():
@@ -299,7 +299,7 @@ def confined_host(room: Room, *arguments: Any) -> WatchedHost:
 
 
 class _memory_is_limited:
-    """A MemoryError of the block is the upload's fault."""
+    """Turn a MemoryError of the block into a fault of the upload."""
 
     def __enter__(self) -> None:
         pass
@@ -310,14 +310,14 @@ class _memory_is_limited:
 
 
 def _folder(package: str) -> Path:
-    """Where a package stands, found without importing it."""
+    """The folder of a package, found without importing it."""
     spec = importlib.util.find_spec(package)
     assert spec is not None and spec.origin is not None, package  # noqa: PT018
     return Path(spec.origin).parent
 
 
 def _own_numba_cache(target: Path, packages: Iterable[Path]) -> None:
-    """Copy the compiled kernels to where this process may write: numba reads no other cache."""
+    """Copy the compiled kernels to a writable folder, the only cache that numba reads."""
     given = os.environ.get(_NUMBA)
     os.environ[_NUMBA] = str(target)
     if given:

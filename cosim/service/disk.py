@@ -1,4 +1,4 @@
-"""How much confined processes write: who writes more than a room has is ended."""
+"""Disk limits of confined processes: a process that exceeds its room's limit is killed."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from pathlib import Path
 from cosim.errors import BadInput
 from cosim.service.settings import MB, Limits
 
-LOOKS = 1.0  # s between two looks
-_BLOCK, _LEAST = 512, 4096  # bytes in one of st_blocks; that a file without any takes
-_BEGAN = 19  # place of a process's start in /proc/PID/stat, behind its name
+LOOKS = 1.0  # s between two checks
+_BLOCK, _LEAST = 512, 4096  # bytes per unit of st_blocks; bytes counted for an empty file
+_BEGAN = 19  # index of the start time in /proc/PID/stat, after the name
 
 
 def folder_prefix() -> str:
-    """How the name of this process's folder begins, by which it is found."""
+    """The prefix of this process's folder name."""
     pid = os.getpid()
     return f"{pid}-{_began(pid)}-"
 
@@ -68,7 +68,7 @@ def _used(folder: Path) -> int:
 
 
 def _end_all(scratch: Path) -> None:
-    """End the processes that have a folder there; whoever has got the number of one since is another."""
+    """Kill the processes with a folder there; reused process ids are recognised by their start time."""
     for folder in scratch.iterdir():
         pid, began, _ = folder.name.split("-", 2)
         with contextlib.suppress(OSError):

@@ -1,4 +1,4 @@
-"""What the server answers with, as OpenAPI describes it."""
+"""The server's answers, as described in OpenAPI."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""What every request passes first: who may ask, how much may be sent; counted and logged when answered."""
+"""The first stage of every request: authorisation, size limits, counters and logs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 PROBES = ("/health", "/ready")
 OPEN = (*PROBES, "/login")  # need no token
-PARTS = "/page/"  # nor do the parts of the page, which hold nobody's data
+PARTS = "/page/"  # static parts of the page, without user data: no token either
 PAGES = ("/", "/runs")  # where a browser without a token is sent to the form
 COOKIE = "cosim"
 UPLOADS = "/api/uploads"
@@ -98,7 +98,7 @@ class Gate:
                 await self._app(scope, _limited(receive, most), answered)
 
     def _refused(self, scope: Scope, headers: dict[bytes, bytes]) -> tuple[int, str] | None:
-        """The status and why; None when the request may pass."""
+        """Status and reason of a refusal; None if the request may pass."""
         host = headers.get(b"host", b"").decode("latin-1")
         origin = headers.get(b"origin")
         if origin is not None and _netloc(origin.decode("latin-1")) != host:
@@ -146,7 +146,7 @@ class Gate:
 
 
 def cookie_of(token: str) -> str:
-    """What a browser keeps in place of the token: it opens this server only, and does not tell the token."""
+    """The cookie in place of the token: valid for this server only, and without the token itself."""
     return hmac.new(token.encode(), b"cosim page", "sha256").hexdigest()
 
 

@@ -8,5 +8,5 @@ ID = re.compile(PATTERN)
 
 
 def new_id() -> str:
-    """A fresh one, which nobody guesses."""
+    """A new, unguessable id."""
     return secrets.token_hex(6)

@@ -1,4 +1,4 @@
-"""The list of runs: what was asked for and how far it is, kept in the database so that a restart goes on."""
+"""The list of runs: requests and progress, kept in the database so that a restart continues."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _jobs = sa.Table(
     sa.Column("request", sa.JSON, nullable=False),  # as it was sent
     sa.Column("uploads", sa.JSON, nullable=False),  # the uploads that it uses
     sa.Column("episodes", sa.Integer, nullable=False),
-    sa.Column("done", sa.Integer, nullable=False),  # of them, when it was last noted
+    sa.Column("done", sa.Integer, nullable=False),  # finished episodes, at the last update
     sa.Column("created", sa.String(32), nullable=False),
     sa.Column("began", sa.String(32)),
     sa.Column("ended", sa.String(32)),
@@ -78,7 +78,7 @@ class Jobs:
                 raise
 
     def add(self, run: str, name: str, request: dict[str, Any], uploads: Sequence[str], episodes: int) -> Job:
-        """A run that waits."""
+        """Add a queued run."""
         values: dict[str, Any] = {
             "run": run,
             "name": name,
@@ -99,17 +99,17 @@ class Jobs:
             connection.execute(_jobs.update().where(_jobs.c.run == run).values(**values))
 
     def remove(self, run: str) -> None:
-        """Forget a run."""
+        """Delete a run."""
         with self._writing() as connection:
             connection.execute(_jobs.delete().where(_jobs.c.run == run))
 
     def get(self, run: str) -> Job | None:
-        """One run; None when there is none of this id."""
+        """One run; None for an unknown id."""
         found = self._read(sa.select(_jobs).where(_jobs.c.run == run))
         return found[0] if found else None
 
     def open(self) -> list[Job]:
-        """Those that run or wait, in the order in which they came."""
+        """Running and waiting runs, oldest first."""
         return self._read(sa.select(_jobs).where(_jobs.c.status.in_(OPEN)).order_by(_jobs.c.number))
 
     def all(self, status: str | None = None) -> list[Job]:
@@ -118,19 +118,19 @@ class Jobs:
         return self._read(query if status is None else query.where(_jobs.c.status == status))
 
     def counts(self) -> dict[str, int]:
-        """How many there are of each status."""
+        """Number of runs by status."""
         query = sa.select(_jobs.c.status, sa.func.count()).group_by(_jobs.c.status)
         with self._engine.connect() as connection:
             found = {status: int(n) for status, n in connection.execute(query)}
         return {status: found.get(status, 0) for status in STATUSES}
 
     def problem(self) -> str | None:
-        """Why this server cannot drive its runs now; None where it can. Raises SQLAlchemyError."""
+        """The reason why this server cannot drive its runs now; None if it can. Raises SQLAlchemyError."""
         self.counts()
         return None if self.claim is None or self.claim.held else "another server drives its runs, or may"
 
     def close(self) -> None:
-        """Let go of the database."""
+        """Close the database connection."""
         if self.claim is not None:
             self.claim.close()
         self._engine.dispose()

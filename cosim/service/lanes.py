@@ -1,4 +1,4 @@
-"""Blocking work on threads of its own, a bounded number of requests waiting: one kind holds up no other."""
+"""Blocking work on separate threads per kind, with a bounded queue, so that no kind blocks another."""
 
 from __future__ import annotations
 

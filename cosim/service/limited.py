@@ -1,4 +1,4 @@
-"""What drives worlds that ship: not confined, but within the limits that uploads have."""
+"""Hosts of shipped scenarios: not confined, but with the limits of uploads."""
 
 from __future__ import annotations
 

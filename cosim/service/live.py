@@ -1,8 +1,8 @@
-"""Who watches a session and what they are sent; the session as their pages ask it to be driven.
+"""Viewers of a session, their messages, and driving on request of their pages.
 
-A page asks for the simulation to be driven up to some moment, and asks again as its own clock comes near: so
-a page that pauses, is slow or gone drives nothing. Whoever else drives the session is never kept waiting: of
-what a slow page has not fetched, the oldest steps are dropped.
+A page requests driving up to some moment, and requests more as its own clock approaches that moment. A page
+that pauses, is slow or gone therefore drives nothing. Other drivers of the session never wait: for a slow
+page the oldest unsent steps are dropped.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from cosim.service.problems import Conflict
 if TYPE_CHECKING:
     from cosim.service.watch import Scene
 
-KEPT = 16  # steps that wait for a page
-WATCHED = 16  # pages a session
+KEPT = 16  # steps buffered for a page
+WATCHED = 16  # pages per session
 
 
 class Stage(Protocol):
-    """What is watched; each method waits for its turn, and raises CosimError."""
+    """The watched session; each method waits for its turn, and raises CosimError."""
 
     def scene(self) -> Scene | None: ...  # None: no episode has begun
 
@@ -35,12 +35,12 @@ class Stage(Protocol):
 
 
 class Viewer:
-    """One page. `take` what it is to be sent whenever `wake` is set."""
+    """One page. `take` returns its messages whenever `wake` is set."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop, self._lock = loop, threading.Lock()
         self.wake = asyncio.Event()
-        self.until = 0.0  # s of the episode that it asks for
+        self.until = 0.0  # s of the episode requested by the page
         self.dropped = 0  # steps
         self.ended = False
         self._steps: deque[str] = deque()
@@ -127,7 +127,7 @@ class Live:
 
     @property
     def number(self) -> int:
-        """How many watch."""
+        """Number of viewers."""
         return len(self._viewers)
 
     # ---- in the session's turn ----
@@ -147,7 +147,7 @@ class Live:
                 viewer.add(self._step)
 
     def join(self, viewer: Viewer) -> None:
-        """One more watches. Raises Conflict when there are too many."""
+        """Add a viewer. Raises Conflict at the limit."""
         if len(self._viewers) >= WATCHED:
             raise Conflict(f"{WATCHED} pages watch it already")
         self._viewers.append(viewer)
@@ -159,7 +159,7 @@ class Live:
     # ---- at any time ----
 
     def leave(self, viewer: Viewer) -> None:
-        """It watches no more."""
+        """Remove a viewer."""
         with self._changed:
             if viewer in self._viewers:
                 self._viewers.remove(viewer)
@@ -180,7 +180,7 @@ class Live:
             self._go()
 
     def ask_explained(self, av: str | None) -> None:
-        """From the next decision on tell which inputs this AV's choices hang on; None: nobody's."""
+        """Select the AV for attribution from the next decision on; None: no AV."""
         with self._changed:
             self._explained.append(av)
             self._go()
@@ -193,7 +193,7 @@ class Live:
             self._changed.notify_all()
 
     def say(self, message: dict[str, str], *, end: bool = False) -> None:
-        """Tell all viewers."""
+        """Notify all viewers."""
         for viewer in [*self._viewers]:
             viewer.say(json.dumps(message), end=end)
 
@@ -213,7 +213,7 @@ class Live:
         self._changed.notify_all()
 
     def _work(self) -> None:
-        """A thread while somebody watches: drive as far as is asked for."""
+        """The thread of a watched session: drive as far as requested."""
         while True:
             with self._changed:
                 while self._viewers and not (self._begin or self._explained or self._until):

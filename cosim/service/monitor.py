@@ -1,4 +1,4 @@
-"""What an operator watches: figures in Prometheus' format, logs as lines of JSON."""
+"""Monitoring for operators: figures in Prometheus' format, logs as lines of JSON."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Figures:
 
 
 class _States:
-    """What is so at the moment it is asked for."""
+    """Gauges computed on request."""
 
     def __init__(self, states: Mapping[str, tuple[str, str, Callable[[], Mapping[str, float]]]]) -> None:
         self._states = states
@@ -75,7 +75,7 @@ class _States:
 
 
 class JsonLines(logging.Formatter):
-    """One object a line: time (UTC), level, logger, message, and whatever `extra` held."""
+    """One object per line: time (UTC), level, logger, message, and the fields of `extra`."""
 
     converter = time.gmtime  # type: ignore[assignment]
 

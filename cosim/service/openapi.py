@@ -1,4 +1,4 @@
-"""The API's description: what FastAPI finds, with who may ask, and an example of every answer in JSON."""
+"""The API's description: FastAPI's schema with authorisation and an example of every JSON answer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which faults may pass: the same run may go well once the disk has room, the database answers."""
+"""Transient faults: a run may succeed later, once the disk has space or the database answers."""
 
 import contextlib
 from collections.abc import Iterator

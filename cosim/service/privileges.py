@@ -1,4 +1,4 @@
-"""Gives up for good what a process may do beyond an ordinary user: root becomes nobody in particular."""
+"""Permanent removal of a process's privileges: root becomes an unprivileged user."""
 
 import ctypes
 import os
@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from cosim.errors import CosimError
 
-NOBODY = 64_000  # user and group: of no account, in the range that systemd gives to services without one
+NOBODY = 64_000  # user and group without an account, in systemd's range for services
 _CHOWN, _READ_SEARCH, _SETGID, _SETUID = 1 << 0, 1 << 2, 1 << 6, 1 << 7  # linux/capability.h
 _VERSION = 0x20080522
 _SET_END, _GET_END, _KEEP, _SECURE = 1, 2, 8, 28  # PR_SET_PDEATHSIG, PR_GET_, PR_SET_KEEPCAPS, _SECUREBITS
@@ -14,14 +14,14 @@ _NO_FIXUP = 1 << 2  # SECBIT_NO_SETUID_FIXUP: access(2), by which SUMO looks for
 
 
 def droppable() -> bool:
-    """Whether this process is no root, or a root that may become somebody else."""
+    """Whether this process is not root, or may change its user."""
     return os.geteuid() != 0 or not (_CHOWN | _SETGID | _SETUID) & ~_capabilities()
 
 
 def drop(folders: Iterable[str]) -> None:
-    """Give up every capability; root becomes NOBODY, to whom `folders` then belong.
+    """Give up every capability; root becomes NOBODY, the new owner of `folders`.
 
-    What was root keeps the one to read and to enter folders (of those that it has): Landlock says which.
+    A former root keeps the capability to read and enter folders, if it had it; Landlock restricts them.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     ended_by = ctypes.c_int()
@@ -47,7 +47,7 @@ def drop(folders: Iterable[str]) -> None:
 
 
 def tasks() -> int:
-    """How many processes and threads this user has, as far as can be seen."""
+    """Number of visible processes and threads of this user."""
     number, user = 0, os.getuid()
     for entry in os.scandir("/proc"):
         if entry.name.isdecimal():

@@ -1,4 +1,4 @@
-"""What a request can meet beside bad input, each with its HTTP status."""
+"""Errors of requests besides bad input, each with its HTTP status."""
 
 from cosim.errors import CosimError
 

@@ -1,4 +1,4 @@
-"""Whether the server can do its work now: each part asked by a thread of its own, and waited for a little."""
+"""Readiness of the server: each part is checked in a separate thread with a timeout."""
 
 from __future__ import annotations
 

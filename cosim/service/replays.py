@@ -1,4 +1,4 @@
-"""Replays of stored episodes: driven again in a process of their own, drawn, kept beside the run's tables."""
+"""Replays of stored episodes: driven again in a separate process, drawn, stored beside the run's tables."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ HEARTBEAT = 60.0  # s
 
 
 class Replays:
-    """Draws them in `lane`; whoever asks for what is being drawn waits for the same."""
+    """Draws replays in `lane`; concurrent requests for the same replay share one drawing."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""What a run is asked for with: the fields of `cosim evaluate`'s Spec, safe names only, into its flags."""
+"""Requests of runs: the fields of `cosim evaluate`'s Spec, restricted to safe names, as its flags."""
 
 import math
 import re
@@ -128,7 +128,7 @@ def flags(
 
 
 def plain(value: object, field: str = "", depth: int = 0) -> None:
-    """Raises BadInput for JSON that nobody means: NaN, endless numbers, texts or lists, NUL in a text."""
+    """Raises BadInput for invalid JSON: NaN, oversized numbers, texts or lists, NUL in a text."""
     problem = ""
     if isinstance(value, Mapping):
         for name, item in value.items():

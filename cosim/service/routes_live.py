@@ -24,7 +24,7 @@ class Asked(BaseModel):
     until: float | None = Field(None, ge=0.0, le=1e9)  # drive up to so many s of the episode
     begin: StrictInt | None = Field(None, ge=0, lt=2**62)  # the episode of this seed
     next: bool = False  # the episode after the last
-    explain: str | None = Field(None, max_length=200)  # the AV whose choices are explained; "": nobody
+    explain: str | None = Field(None, max_length=200)  # the AV whose choices are explained; "": none
 
 
 def live_router(sessions: Sessions, lane: Lane) -> APIRouter:
@@ -62,7 +62,7 @@ def live_router(sessions: Sessions, lane: Lane) -> APIRouter:
 def _answer(one: Open, viewer: Viewer, asked: Asked) -> None:
     if asked.explain is not None:
         one.live.ask_explained(asked.explain or None)
-    if one.live.program:  # two drivers would be one too many
+    if one.live.program:  # a program drives the session already
         return
     if asked.begin is not None or asked.next:
         one.live.ask_begin(asked.begin)
@@ -71,7 +71,7 @@ def _answer(one: Open, viewer: Viewer, asked: Asked) -> None:
 
 
 async def _send(socket: WebSocket, viewer: Viewer) -> None:
-    """All that a viewer is told, as fast as its page takes it."""
+    """Send all messages of a viewer, at the pace of its page."""
     while True:
         await viewer.wake.wait()
         viewer.wake.clear()

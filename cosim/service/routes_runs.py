@@ -33,7 +33,7 @@ Episode = Annotated[
     ),
 ]
 Texts = Annotated[list[Annotated[str, Query(max_length=LONGEST)]], Query(max_length=20)]
-# What a report may do: it is a file that was made of somebody's names.
+# Restrictions of a report, because it contains users' names.
 SANDBOX = {
     "Content-Security-Policy": "sandbox allow-scripts; default-src 'none'; img-src data:; "
     "style-src 'unsafe-inline'; script-src 'unsafe-inline'; font-src data:"

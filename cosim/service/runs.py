@@ -38,10 +38,10 @@ from cosim.workers.pool import Cancelled, Pool, PoolEngine
 from cosim.workers.ray_engine import RayEngine
 from cosim.workers.supervisor import Limits as WorkerLimits
 
-ENDING = 10.0  # s that runs may take to end when the server does
-RETRY = 5.0  # s until a database that could not be used is tried again, and first until a run is,
-TRIES = 8  # times in a row without a new row: each time twice as long, 21 min in all
-ACTIVE = 8  # runs that are driven at once on the processes of this machine
+ENDING = 10.0  # s for runs to end when the server stops
+RETRY = 5.0  # s until an unusable database is tried again, and until the first retry of a run
+TRIES = 8  # retries without a new row, each after twice the time, 21 min in all
+ACTIVE = 8  # concurrent runs on the processes of this machine
 REPORT, SUMMARY = "report.html", "summary.json"
 OUTPUTS = "outputs"  # the folder of SUMO's own
 T = TypeVar("T")
@@ -53,14 +53,14 @@ class Drive:
 
     def __init__(self) -> None:
         self.episodes = self.done = 0
-        self.before = 0  # driven by an earlier server
+        self.before = 0  # episodes of an earlier server
         self.began = time.monotonic()
         self.cancelled = threading.Event()
         self.left = False  # to another server, or the next start
         self.engine: Engine | None = None
 
     def leave(self) -> None:
-        """End it at once; what became of it is not noted."""
+        """Stop at once without recording a status."""
         self.left = True
         self.cancel()
 
@@ -91,7 +91,7 @@ class Drive:
 
 
 class Waiting:
-    """A run that waits to be tried again after a fault that may pass."""
+    """A run that waits for a retry after a transient fault."""
 
     def __init__(self, tries: int, rows: int) -> None:
         self.tries = tries  # so far, since it had fewer rows
@@ -191,7 +191,7 @@ class Runs:
         return job
 
     def estimate(self, flags: dict[str, Any], uploads: Sequence[str]) -> dict[str, Any]:
-        """How long a run would take on a server that does nothing else, from short episodes driven now."""
+        """The estimated time of a run on an idle server, from short episodes driven now."""
         plan = self._clerks.plan(flags, uploads)
         workers = self.pool.workers if self.pool else self._settings.workers or cores()
         with room(self._settings, uploads) as confined:
@@ -225,11 +225,11 @@ class Runs:
                 self._clerks.call("report", run)
 
     def drive(self, run: str) -> Drive | None:
-        """What is known of a run that is driven now."""
+        """The progress of an active run."""
         return self._drives.get(run)
 
     def place(self, run: str) -> int | None:
-        """How many wait before this one; None when it does not wait."""
+        """Number of runs ahead in the queue; None if this run does not wait."""
         with self._changed:
             return self._queue.index(run) if run in self._queue else None
 
@@ -269,7 +269,7 @@ class Runs:
         return self.get(run)
 
     def remove(self, run: str) -> None:
-        """Forget a run and its files. Raises Conflict while it waits or is driven."""
+        """Delete a run and its files. Raises Conflict while it waits or is active."""
         job = self.get(run)
         if job.status in (QUEUED, RUNNING):
             raise Conflict(f"run {run} is {job.status}: cancel it first")
@@ -324,7 +324,7 @@ class Runs:
             log.info("runs picked up", extra={"runs": len(found)})
 
     def _keep(self) -> None:
-        """A thread: see to it that the database is this server's, and drive nothing while it is not."""
+        """A thread: keep the claim on the database, and stop driving without it."""
         claim = self._jobs.claim
         assert claim is not None
         while not self._closed:
@@ -354,7 +354,7 @@ class Runs:
             with contextlib.suppress(CosimError), self._store(run) as store:
                 store.remove()
         gone = self._settings.scratch / run
-        with contextlib.suppress(OSError):  # moved first: who reads it meanwhile makes no file in it again
+        with contextlib.suppress(OSError):  # moved first: a concurrent reader creates no new file in it
             self.folder(run).rename(gone)
         shutil.rmtree(gone, ignore_errors=True)
 
@@ -402,7 +402,7 @@ class Runs:
             return None
 
     def _run(self, job: Job, plan: Plan | None, drive: Drive) -> None:
-        """Drive one run and note what became of it."""
+        """Drive one run and record its status."""
         run, drive.episodes = job.run, job.episodes
         self._patiently(self._jobs.set, run, status=RUNNING, began=job.began or now(), error=None)
         log.info("run began", extra={"run": run})
@@ -429,7 +429,7 @@ class Runs:
         log.info("run ended", extra={"run": run, "status": status, "seconds": seconds})
 
     def _said(self, run: str, problem: Exception) -> str:
-        """What a user is told of it: nothing of the server's own."""
+        """The message for users, without internals of the server."""
         if isinstance(problem, BadInput):
             return str(shown(problem, self._settings))
         if isinstance(problem, CosimError):  # a store names its database, the command line's way to go on

@@ -102,7 +102,7 @@ def serve(data: str, *, host: str, port: int, said: TextIO, **settings: Any) -> 
 
 
 def _bind(host: str, port: int) -> socket.socket:
-    """Raises BadInput: no such address, or somebody else's."""
+    """Raises BadInput for an unknown address, or one in use."""
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
     except OSError as error:

@@ -1,4 +1,4 @@
-"""Sessions that drivers elsewhere hold open: each a simulation in a process of its own, ended when idle."""
+"""Sessions of remote clients: each a simulation in a separate process, closed when idle."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Served(Session):
 
     reply: Reply
     passes_on = False
-    live: Live | None = None  # who watches
+    live: Live | None = None  # the viewers
 
     def reset(self, seed: int | None = None, *, passes_on: bool = False) -> dict[str, View]:
         """As `Session.reset`."""
@@ -68,28 +68,28 @@ class Served(Session):
         if self.live is not None:
             self.live.told(reply.steps == 0)
 
-    # ---- what `Live` looks at ----
+    # ---- for `Live` ----
 
     def scene(self) -> Scene | None:
-        """The episode as those see it who begin to watch; None where none has begun."""
+        """The episode for a new viewer; None before the first episode."""
         return self._call("scene") if self.begun else None
 
     def drawn(self) -> tuple[list[str], str]:
-        """What the last decision brought."""
+        """The result of the last decision."""
         found: tuple[list[str], str] = self._call("drawn")
         return found
 
     def explain(self, av: str | None) -> None:
-        """Tell which inputs this AV's choices hang on; None: nobody's."""
+        """Select the AV for attribution; None: no AV."""
         self._call("explain", av)
 
     def unwatched(self) -> None:
-        """Nobody looks any more."""
+        """Stop observing for viewers."""
         self._call("unwatched")
 
 
 class Open:
-    """One session and who holds it."""
+    """One session and its current users."""
 
     def __init__(
         self,
@@ -158,11 +158,11 @@ class Open:
         self.live.end(reason)
 
     def watch(self, viewer: Viewer) -> None:
-        """One more page watches. Raises NotFound, Conflict."""
+        """Add a viewer. Raises NotFound, Conflict."""
         with self.using():
             self.live.join(viewer)
 
-    # ---- driven for those who watch ----
+    # ---- driven for viewers ----
 
     def _drive(self, until: float) -> bool:
         with self.using() as session:

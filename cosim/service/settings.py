@@ -1,4 +1,4 @@
-"""What a server is started with, and where it keeps things."""
+"""A server's settings, and its files."""
 
 import contextlib
 import ipaddress
@@ -18,7 +18,7 @@ MB = 1 << 20
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What the server takes and how much of it; sizes in bytes, times in s."""
+    """The server's limits; sizes in bytes, times in s."""
 
     body: int = 1 * MB  # of a request, uploads apart
     upload: int = 64 * MB  # of an archive
@@ -51,7 +51,7 @@ class Settings:
     workers: int | None = None  # processes of runs; None: one a core
     engine: str = "local"
     ray_address: str | None = None
-    token: str | None = None  # None: whoever reaches the server may use it
+    token: str | None = None  # None: no authorisation
     limits: Limits = Limits()
 
     @property

@@ -1,4 +1,4 @@
-"""What users send: archives of a scenario or of weights, unpacked with limits, examined, kept."""
+"""Uploads of users: archives of a scenario or of weights, unpacked with limits, examined, stored."""
 
 from __future__ import annotations
 
@@ -159,7 +159,7 @@ def _of_the_archive(folder: Path) -> Iterator[None]:
 def _settled(folder: Path, limits: Limits) -> dict[str, int]:
     """Name -> bytes of every file below `folder`; they belong to this process's user from now on.
 
-    Whoever wrote them has ended. Raises BadInput: links, or what is neither a file nor a folder; too much.
+    The writing process has ended. Raises BadInput for links, special files, or a size above the limit.
     """
     found: dict[str, int] = {}
     for path, folders, names in os.walk(folder, onerror=_raise):

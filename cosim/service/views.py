@@ -1,4 +1,4 @@
-"""A session's answers as JSON for any program: plain names and SI units, null where nothing is ahead."""
+"""A session's answers as JSON: plain names and SI units, null for missing objects."""
 
 from __future__ import annotations
 

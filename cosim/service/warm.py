@@ -1,4 +1,4 @@
-"""The kernels, compiled when the server starts: no decision of a session waits for a compiler.
+"""Compilation of the kernels at the server's start, so that no session waits for it.
 
 numba keeps what it compiled on disk, for the processor and version that it was compiled for.
 """

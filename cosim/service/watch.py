@@ -1,4 +1,4 @@
-"""The simulation's side of watching a session: what a page draws, as JSON, made only while somebody looks.
+"""The simulation's side of watching a session: JSON for the page, computed only while viewers exist.
 
 A `Scene` comes first; then every decision brings what stays (`lasting`: words, vehicles, events) and a step,
 which may be lost on its way: it holds whole positions, no differences.
@@ -33,7 +33,7 @@ FIGURES_EVERY = 2  # decisions between two tables of figures
 
 
 class Scene(NamedTuple):
-    """What somebody needs who begins to watch."""
+    """The data for a new viewer."""
 
     road: str
     episode: str
@@ -42,7 +42,7 @@ class Scene(NamedTuple):
 
 
 class Notes(Hook):
-    """What happened in the episode so far, and how the session's earlier episodes ended."""
+    """The history of the episode, and results of the session's earlier episodes."""
 
     def __init__(self) -> None:
         self.ended: dict[int, dict[str, Any]] = {}  # seed -> figures of its last whole episode
@@ -70,7 +70,7 @@ class Notes(Hook):
 
 
 class Picture:
-    """One episode for those who watch it."""
+    """One episode for its viewers."""
 
     def __init__(
         self,
@@ -85,11 +85,11 @@ class Picture:
         self._svo, self._explained = svo, explained
         self._names = Names()
         self._told = dict.fromkeys(("words", "collisions", "violations", "interventions", "errors"), 0)
-        self.lasting: list[str] = []  # not told yet
+        self.lasting: list[str] = []  # not sent yet
         self.step = ""  # the last one
 
     def begin(self, episode: Episode) -> Scene:
-        """What is there now."""
+        """The present scene."""
         self.step = _text({"frames": [self._frame(episode.snapshot)], **self._now(episode)})
         self._note(episode)
         head = {
@@ -128,7 +128,7 @@ class Picture:
         self.step = _text(found)
 
     def told(self) -> list[str]:
-        """What is new and stays."""
+        """New persistent data."""
         found, self.lasting = self.lasting, []
         return found
 
@@ -153,7 +153,7 @@ class Picture:
         return [ms(s.time), numbers, *whole, lanes, signals]
 
     def _meet(self, s: Snapshot) -> None:
-        """Number those who are new."""
+        """Number new vehicles."""
         known = self._names.vehicles
         if not (new := [k for k, name in enumerate(s.ids) if name not in known]):
             return
@@ -199,7 +199,7 @@ class WatchedHost(SessionHost):
         self._road: DrawnRoad | None = None
 
     def scene(self) -> Scene:
-        """Begin to be watched, or begin anew."""
+        """Start or restart watching."""
         self._check_started()
         if self._road is None:
             s = self.simulator
@@ -209,7 +209,7 @@ class WatchedHost(SessionHost):
         return picture.begin(self.episode)
 
     def explain(self, av: str | None) -> None:
-        """Tell from the next decision on which inputs this AV's choices hang on; None: nobody's."""
+        """Select the AV for attribution from the next decision on; None: no AV."""
         if self._explainer is not None:
             self._explainer.asked, self._explainer.uses = av, ()
 
@@ -220,7 +220,7 @@ class WatchedHost(SessionHost):
         return picture.told(), picture.step
 
     def unwatched(self) -> None:
-        """Nobody looks any more."""
+        """Stop watching."""
         self._notes.picture = None
         self.explain(None)
 

@@ -1,4 +1,4 @@
-"""A session's answers as bytes for our own client: arrays as safetensors, the rest as JSON in their metadata.
+"""A session's answers as bytes for cosim's client: arrays as safetensors, the rest as JSON metadata.
 
 Nothing is ever unpickled: a server is trusted with what it says, not with the client's process.
 """
@@ -47,7 +47,7 @@ def unpack(data: bytes) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
 
 
 def of_reply(reply: Reply) -> bytes:
-    """What one reset or act brought."""
+    """The reply to one reset or act."""
     packed = reply.packed
     document = {
         "avs": packed.avs,

@@ -1,1 +1,1 @@
-"""Objects in supervised processes of their own: a worker, its supervisor, engines that run tasks."""
+"""Objects in supervised processes: a worker, its supervisor, engines that run tasks."""

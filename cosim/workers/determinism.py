@@ -4,7 +4,7 @@ import sys
 
 
 def make_torch_deterministic() -> None:
-    """Call once the policy is made. cosim never imports torch: without a policy that did, nothing happens."""
+    """Call after construction of the policy; without torch (which cosim never imports) it does nothing."""
     torch = sys.modules.get("torch")
     if torch is None:
         return

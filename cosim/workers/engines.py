@@ -1,4 +1,4 @@
-"""Who drives the tasks: one small protocol, and the engine that uses processes of this machine."""
+"""Engines that run tasks: the protocol, and the engine on processes of this machine."""
 
 import os
 import queue
@@ -9,13 +9,13 @@ from typing import Any, Protocol
 from cosim.workers.supervisor import Factory, Limits, Supervisor
 from cosim.workers.tasks import Outcome, Task, TaskQueue
 
-ENDING = 10.0  # s that a worker may take to end
+STOP_TIMEOUT = 10.0  # s for a worker to end
 
 
 class Engine(Protocol):
-    """Spreads tasks over worker processes and yields an outcome for each, in the order they come in.
+    """Distributes tasks over worker processes and yields outcomes in order of completion.
 
-    Closing the generator (or leaving the loop by an exception) ends everything that it started.
+    Closing the generator (or leaving the loop by an exception) ends all of its processes.
     """
 
     def run(self, tasks: Sequence[Task]) -> Generator[Outcome, None, None]:
@@ -57,7 +57,7 @@ class LocalEngine:
                 while not stopped.is_set() and (task := tasks_left.take(group)) is not None:
                     group = task.group
                     arrived.put(supervisor.run(task))
-            except BaseException as error:  # a fault of ours: raised in the caller's thread
+            except BaseException as error:  # an internal error: raised in the caller's thread
                 arrived.put(error)
             finally:
                 supervisor.close()
@@ -75,14 +75,14 @@ class LocalEngine:
                     raise outcome
                 yield outcome
             for thread in threads:
-                thread.join(timeout=ENDING)
+                thread.join(timeout=STOP_TIMEOUT)
         finally:
             stopped.set()
             waiting = [(s, t) for s, t in zip(supervisors, threads, strict=True) if t.is_alive()]
             for supervisor, _ in waiting:
                 supervisor.kill()
             for _, thread in waiting:
-                thread.join(timeout=ENDING)
+                thread.join(timeout=STOP_TIMEOUT)
 
 
 def cores() -> int:

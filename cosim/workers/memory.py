@@ -1,4 +1,4 @@
-"""Freed memory stays with the process: every step's arrays reuse warm pages, none are faulted anew."""
+"""Freed memory stays with the process, so that arrays reuse mapped pages without new page faults."""
 
 import ctypes
 

@@ -1,4 +1,4 @@
-"""One set of supervised processes that many batches share: each batch has an engine of its own on it."""
+"""A pool of supervised processes shared by many batches, with an engine per batch."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ import time
 from collections.abc import Generator, Sequence
 from typing import Any
 
-from cosim.workers.engines import ENDING, cores
+from cosim.workers.engines import STOP_TIMEOUT, cores
 from cosim.workers.supervisor import Factory, Limits, Supervisor
 from cosim.workers.tasks import Outcome, Task, TaskQueue
 
-TURN = 10.0  # s that a process stays with one batch while another one has none
+MIN_TURN = 10.0  # s that a process stays with one batch while another batch has no process
 
 
 class Cancelled(Exception):
-    """The batch was cancelled: raised where its outcomes are awaited."""
+    """The batch was cancelled; raised to the reader of its outcomes."""
 
 
 class Pool:
     """`workers` processes, each supervised by a thread of its own, shared by all batches fairly.
 
-    A free process goes to the batch that has the fewest; one that has worked for `TURN` s for a batch goes
-    to a batch that has none. A process is kept for the next batch that hosts the same.
+    A free process goes to the batch with the fewest processes. After `MIN_TURN` s with one batch a process
+    moves to a batch without any. A process is reused by the next batch with the same hosted object.
     """
 
     def __init__(self, workers: int | None = None) -> None:
@@ -35,12 +35,12 @@ class Pool:
 
     @property
     def busy(self) -> int:
-        """How many of the processes work at a task."""
+        """Number of processes with a task."""
         return sum(seat.batch is not None for seat in self._seats)
 
     @property
     def alive(self) -> int:
-        """How many of them have a thread that supervises them."""
+        """Number of processes with a live supervising thread."""
         return sum(seat.thread.is_alive() for seat in self._seats)
 
     def engine(
@@ -50,7 +50,7 @@ class Pool:
         return PoolEngine(self, (factory, arguments, limits or Limits()))
 
     def close(self) -> None:
-        """End every process; whoever awaits outcomes gets `Cancelled`."""
+        """End every process; readers of outcomes get `Cancelled`."""
         with self._changed:
             self._closed = True
             for batch in self._batches:
@@ -59,7 +59,7 @@ class Pool:
         for seat in self._seats:
             seat.kill()
         for seat in self._seats:
-            seat.thread.join(timeout=ENDING)
+            seat.thread.join(timeout=STOP_TIMEOUT)
 
     # ---- for the engines and the seats ----
 
@@ -72,7 +72,7 @@ class Pool:
             self._changed.notify_all()
 
     def end(self, batch: PoolEngine) -> None:
-        """Nobody waits for `batch` any more: what works at it is ended."""
+        """Withdraw `batch`: end the processes that work on it."""
         with self._changed:
             batch.ended = True
             self._batches.remove(batch)
@@ -86,7 +86,7 @@ class Pool:
             while not self._closed:
                 crowd = {id(b): sum(s.batch is b for s in self._seats) for b in self._batches}
                 choice = sorted(self._batches, key=lambda b: crowd[id(b)])
-                turn_is_over = time.monotonic() - seat.since > TURN and 0 in crowd.values()
+                turn_is_over = time.monotonic() - seat.since > MIN_TURN and 0 in crowd.values()
                 if seat.last in choice and not turn_is_over:
                     choice.insert(0, seat.last)
                 for batch in choice:
@@ -105,7 +105,7 @@ class PoolEngine:
         self.tasks = TaskQueue(())
         self.ended = False
         self.arrived: queue.SimpleQueue[Outcome | BaseException] = queue.SimpleQueue()
-        self.running: dict[str, tuple[float, float]] = {}  # key -> how much is done, of how much
+        self.running: dict[str, tuple[float, float]] = {}  # key -> (done, total)
 
     def run(self, tasks: Sequence[Task]) -> Generator[Outcome, None, None]:
         """Exactly one outcome per task. Raises Cancelled when `cancel` was called."""
@@ -129,7 +129,7 @@ class _Seat:
     """One process of the pool and the thread that supervises it."""
 
     def __init__(self, pool: Pool, number: int) -> None:
-        self.batch: PoolEngine | None = None  # it works at a task of this one
+        self.batch: PoolEngine | None = None  # batch of its present task
         self.last: PoolEngine | None = None  # the batch of its last task,
         self.group: str | None = None  # that task's group,
         self.since = 0.0  # and when it came to that batch, s
@@ -169,7 +169,7 @@ class _Seat:
             outcome: Outcome | BaseException
             try:
                 outcome = self._run(batch, task)
-            except BaseException as error:  # a fault of ours: raised where the outcomes are awaited
+            except BaseException as error:  # an internal error: raised to the reader of outcomes
                 outcome = error
             batch.running.pop(task.key, None)
             self.batch = None

@@ -24,21 +24,21 @@ class _Lines(tqdm):  # type: ignore[misc]  # tqdm is not typed
 
     @staticmethod
     def status_printer(file: TextIO) -> Callable[[str], None]:
-        """How one is written."""
+        """The writer of a line."""
         return lambda text: print(text, file=file, flush=True)
 
     def close(self) -> None:
-        """There is nothing to clear."""
+        """Nothing to clear."""
         self.disable = True
 
 
 class Progress(contextlib.AbstractContextManager["Progress"]):
     """Call it with (done, total); `unit` names what is counted. Writes nothing when `quiet`.
 
-    A total of 0: there is nothing to count yet, kernels are being compiled.
+    A total of 0 means that kernels are being compiled.
 
-    Rate and time left are a moving average over the last reports; what came before the first one, the start
-    of processes and the like, does not count.
+    Rate and time left are a moving average over the last reports, without the time before the first report
+    (start of processes).
     """
 
     def __init__(self, title: str, unit: str, *, quiet: bool = False, stream: TextIO | None = None) -> None:
@@ -51,7 +51,7 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
         self._note.daemon = True
 
     def starting(self, after: float = 1.0) -> None:
-        """Say what takes so long if nothing has been done `after` s from now."""
+        """Print the reason of the delay if nothing is done `after` s from now."""
         if not self._quiet:
             self._note.interval = after
             self._note.start()
@@ -95,7 +95,7 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
             self._bar.close()
 
     def say(self, line: str) -> None:
-        """Write a line, above the bar where there is one."""
+        """Write a line, above the bar if there is one."""
         if self._quiet:
             return
         bar = self._bar if self._terminal else None
@@ -108,7 +108,7 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
 
 
 def shown(items: Iterable[Item], total: int, title: str, unit: str, *, quiet: bool = False) -> Iterator[Item]:
-    """The items one by one, with the progress of what is done with them; `total`: how many there are."""
+    """The items one by one, with progress; `total`: number of items."""
     with Progress(title, unit, quiet=quiet) as progress:
         for done, item in enumerate(items, 1):
             yield item

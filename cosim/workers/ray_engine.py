@@ -1,8 +1,8 @@
-"""The engine that distributes tasks over a Ray cluster: an extra, imported only when it is asked for.
+"""The engine for a Ray cluster: an extra, imported only when needed.
 
-An actor per worker holds the same `Supervisor` as the local engine does, so that crashes, hangs and retries
-are treated alike and SUMO never runs inside a Ray process. What Ray adds is the loss of an actor, with its
-node or without: its task goes back and another actor takes it.
+An actor per worker holds the same `Supervisor` as in the local engine, so crashes, hangs and retries are
+handled alike, and SUMO never runs inside a Ray process. Ray adds the loss of an actor, alone or with its
+node: its task is returned and assigned to another actor.
 """
 
 import os
@@ -18,18 +18,18 @@ from cosim.workers.pool import Cancelled
 from cosim.workers.supervisor import Factory, Limits, Supervisor
 from cosim.workers.tasks import SIM_CRASH, Outcome, Task, TaskQueue
 
-LOSSES = 6  # actors that may be lost at one task: as often as a process may be killed at it
-LOOK_EVERY = 0.5  # s between looks whether the run was cancelled
-NOTICE_AFTER = 30.0  # s without any running actor before a note is printed
+MAX_LOSSES = 6  # lost actors per task, equal to the allowed kills of a process
+POLL_INTERVAL = 0.5  # s between checks for cancellation
+NOTICE_DELAY = 30.0  # s without any running actor before a note is printed
 _CONNECTING = threading.Lock()
 
 
 class RayEngine:
     """Workers on an existing cluster (`address`) or on a local one, started and ended with the run.
 
-    `workers`: how many actors of one core each; by default one per core of the cluster. Each node needs
-    cosim installed, in the same versions, and a user's files under the same paths (our worlds come with
-    the installation).
+    `workers`: number of actors, one core each; by default one per core of the cluster. Each node needs the
+    same versions of cosim and its packages, and a user's files under the same paths (shipped scenarios are
+    part of the installation).
 
     Raises:
         BadInput: ray is not installed, or no cluster answers at the address.
@@ -80,12 +80,12 @@ class RayEngine:
         self._cancelled.set()
 
     def disconnect(self) -> None:
-        """End a connection that was kept, and the local cluster with it."""
+        """Close a kept connection, and the local cluster with it."""
         with _CONNECTING:
             self._ray.shutdown()
 
     def _connect(self) -> bool:
-        """Whether there was no connection before."""
+        """Connect if necessary; whether a new connection was made."""
         with _CONNECTING:
             if self._ray.is_initialized():
                 return False
@@ -110,7 +110,7 @@ class RayEngine:
 
 
 class _Actors:
-    """The actors, and which task each of them is at."""
+    """The actors and their present tasks."""
 
     def __init__(
         self,
@@ -137,12 +137,12 @@ class _Actors:
             self._start_actor()
         heard = time.monotonic()
         while left:
-            ready, _ = self._ray.wait(list(self._calls), num_returns=1, timeout=LOOK_EVERY)
+            ready, _ = self._ray.wait(list(self._calls), num_returns=1, timeout=POLL_INTERVAL)
             if self._cancelled.is_set():
                 raise Cancelled
             if ready:
                 heard = time.monotonic()
-            elif time.monotonic() - heard > NOTICE_AFTER:
+            elif time.monotonic() - heard > NOTICE_DELAY:
                 heard = time.monotonic()
                 if all(task is None for _, task, _ in self._calls.values()):
                     print("cosim: waiting for the Ray cluster to offer a core", file=sys.stderr, flush=True)
@@ -170,7 +170,7 @@ class _Actors:
         self._calls.clear()
 
     def _start_actor(self) -> None:
-        """One more actor; it gets no task before it answers: after the loss of a node no core may be free."""
+        """Start an actor; it gets tasks once it answers, because after a node's loss no core may be free."""
         actor = self._actor.remote(*self._settings)
         self._calls[actor.ready.remote()] = (actor, None, None)
 
@@ -182,14 +182,14 @@ class _Actors:
             self._calls[actor.run.remote(task)] = (actor, task, task.group)
 
     def _lost(self, task: Task, error: Exception, tasks_left: TaskQueue) -> Outcome | None:
-        """The task of a lost actor goes back, unless too many were lost at it."""
+        """Return the task of a lost actor to the queue, up to `MAX_LOSSES` times."""
         self._losses[task.key] += 1
-        if self._losses[task.key] < LOSSES:
+        if self._losses[task.key] < MAX_LOSSES:
             tasks_left.put_back(task)
             return None
         words = " ".join(str(error).split())[:500]
-        problem = f"{LOSSES} Ray workers were lost at it: {words}"
-        return Outcome(task.key, SIM_CRASH, error=problem, attempts=LOSSES)
+        problem = f"{MAX_LOSSES} Ray workers were lost at it: {words}"
+        return Outcome(task.key, SIM_CRASH, error=problem, attempts=MAX_LOSSES)
 
 
 class _Actor:

@@ -1,4 +1,4 @@
-"""One worker process that may crash or hang, and what is done about it: tasks in, an outcome for each.
+"""The supervisor of one worker process that may crash or hang: tasks in, an outcome for each.
 
 The hosted object (`cosim.workers.tasks.Hosted`) is built in the process and may do anything.
 """
@@ -18,9 +18,9 @@ from cosim.workers.worker import Worker
 
 Factory = Callable[..., Hosted]
 
-# SUMO never sends itself these: a person, or the kernel short of memory, ended the process.
+# Signals that SUMO never raises itself: sent by a person, or by the kernel when memory is short.
 KILLED_FROM_OUTSIDE = frozenset(-s for s in (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, signal.SIGINT))
-HEARTBEAT = 1.0  # s between two that are sent: a message costs too much for a step of 2 ms
+HEARTBEAT = 1.0  # s between two heartbeats: a message per step of 2 ms would be too expensive
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 _ENDS: dict[type[CosimError], str] = {  # the first that an error is
@@ -30,7 +30,7 @@ _ENDS: dict[type[CosimError], str] = {  # the first that an error is
     SimulationError: "failed",
     CosimError: "fault",
 }
-# How an attempt can end, and the status a task gets when it is not tried again.
+# Ending of an attempt -> status of a task without a retry.
 _STATUS = {
     "done": OK,
     "refused": BAD_INPUT,  # the same would be refused again
@@ -44,18 +44,18 @@ _STATUS = {
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """How long to wait, how often to try."""
+    """Timeouts and numbers of attempts."""
 
     step: float = 120.0  # s without a heartbeat while a task runs: a decision takes ms, at most seconds
     start: float = 600.0  # s until its first heartbeat: process, net, warm-up (A10KW: 3 s)
-    crashes: int = 2  # attempts when the process crashes: the second shows whether it does so again
-    kills: int = 6  # attempts when it is killed from outside, which says nothing about the task
-    timeouts: int = 1  # attempts when it hangs: the second would hang as long
+    crashes: int = 2  # attempts after a crash: the second shows whether it is reproducible
+    kills: int = 6  # attempts after a kill from outside, which is unrelated to the task
+    timeouts: int = 1  # attempts after a hang: a second attempt would hang as long
     recycle: int = 200  # tasks before a fresh process: memory was flat over 120 episodes, a precaution
 
 
 class Supervisor:
-    """Owns one worker process at a time. `run` never raises for what a task does; it restarts the process.
+    """Owns one worker process at a time. `run` never raises for a task's failure; it restarts the process.
 
     To be created, used and closed by one thread: the process ends with the thread that started it
     (PR_SET_PDEATHSIG), so that no process outlives a parent that was killed. `kill` may come from any.
@@ -90,7 +90,7 @@ class Supervisor:
             ends[end] += 1
             if end != "done":
                 if end != "refused":
-                    self._drop()  # whatever it is in now, the next task must not meet it
+                    self._drop()  # discard the process's unknown state
                 if ends[end] < allowed.get(end, 1) and not self._ended:
                     continue
             seconds = time.monotonic() - began
@@ -104,7 +104,7 @@ class Supervisor:
             worker.kill()
 
     def close(self) -> None:
-        """Ask the process to end, and see to it that it does."""
+        """Ask the process to end, and kill it if necessary."""
         self._ended = True
         self._drop()
 
@@ -176,7 +176,7 @@ class _WorkerSide:
 
 
 def _end_with(parent: int) -> None:
-    """Have the kernel kill this process when its parent is gone, even in the midst of a step of SUMO's."""
+    """Have the kernel kill this process when its parent ends, even during a step of SUMO."""
     if not hasattr(ctypes, "CDLL") or os.uname().sysname != "Linux":
         return  # elsewhere the broken pipe ends it at the next heartbeat
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)

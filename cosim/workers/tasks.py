@@ -1,4 +1,4 @@
-"""Tasks and their outcomes, and the queue that decides which worker gets which task next."""
+"""Tasks, outcomes, and the queue that assigns tasks to workers."""
 
 import threading
 from collections import Counter, deque
@@ -12,11 +12,11 @@ OK, SIM_CRASH, TIMEOUT, BAD_INPUT = STATUSES = ("ok", "sim_crash", "timeout", "b
 FAULT = "fault"  # our own code failed: the task has no result and should be run again once the code is fixed
 
 
-Progress = Callable[[float, float], None]  # a heartbeat: how much is done, of how much
+Progress = Callable[[float, float], None]  # a heartbeat: done, total
 
 
 class Hosted(Protocol):
-    """What runs in a worker process."""
+    """The object hosted in a worker process."""
 
     @property
     def run(self) -> Callable[..., Any]:
@@ -41,7 +41,7 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of one task; `value` is what `Hosted.run` returned, None unless `status` is ok."""
+    """The outcome of one task; `value` is the result of `Hosted.run`, None unless `status` is ok."""
 
     key: str
     status: str  # one of STATUSES, or FAULT

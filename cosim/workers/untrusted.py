@@ -19,7 +19,7 @@ from multiprocessing.context import set_spawning_popen
 from multiprocessing.process import BaseProcess
 from typing import Any, TypeVar
 
-LARGEST = 1 << 28  # bytes of an answer
+MAX_ANSWER = 1 << 28  # bytes of an answer
 _VARIABLES = (
     "HOME",
     "LANG",

@@ -1,4 +1,4 @@
-"""One object in a process of its own, supervised: when SUMO crashes, the caller does not.
+"""One object in a supervised process, so that a crash of SUMO does not crash the caller.
 
 A net that crashes SUMO ends the process that imported libsumo (docs/reference/sumo.md). So whatever drives a
 simulation runs in a spawned worker, called through a pipe; its crash or missing heartbeat is an exception.
@@ -126,7 +126,7 @@ class Worker(contextlib.AbstractContextManager["Worker"]):
             self.close()
 
     def _wait(self) -> None:
-        """Until the factory has built its object."""
+        """Wait until the factory has built its object."""
         if self._started:
             return
         try:
@@ -165,7 +165,7 @@ class Worker(contextlib.AbstractContextManager["Worker"]):
         if not self._untrusted:
             return self._pipe.recv()  # type: ignore[no-any-return]
         try:
-            kind, value = untrusted.load(self._pipe.recv_bytes(untrusted.LARGEST))
+            kind, value = untrusted.load(self._pipe.recv_bytes(untrusted.MAX_ANSWER))
             if kind in ("value", "progress") or isinstance(value, CosimError):
                 return kind, value
         except (EOFError, ConnectionResetError):
@@ -191,7 +191,7 @@ class Worker(contextlib.AbstractContextManager["Worker"]):
         return SimulationCrashed(problem, exitcode=code, stderr=stderr)
 
     def _call_stderr(self) -> str:
-        """What the process wrote during this call."""
+        """The stderr of the process during this call."""
         with self._stderr.open("rb") as file:
             file.seek(max(self._call_begin, self._stderr.stat().st_size - 4 * STDERR_KEPT))
             return file.read(4 * STDERR_KEPT).decode("utf-8", "replace").strip()[-STDERR_KEPT:]
@@ -232,7 +232,7 @@ def _one_blas_thread() -> Iterator[None]:
 
 
 def _serve(pipe: Connection, factory: Callable[..., Any], arguments: tuple[Any, ...], stderr: str) -> None:
-    """The worker's whole life. Ends when the pipe breaks, so it never outlives its parent."""
+    """The worker's main loop. It ends when the pipe breaks, so the worker never outlives its parent."""
     keep_freed_memory()
     os.dup2(2, 1)  # what a policy prints goes to stderr: stdout is for the caller's document
     file = os.open(stderr, os.O_RDWR | os.O_APPEND)  # as `cosim.simulation.stderr` wants it, to read back
@@ -254,7 +254,7 @@ def _serve(pipe: Connection, factory: Callable[..., Any], arguments: tuple[Any, 
             return True
         except CosimError as error:
             pipe.send(("error", error))
-        except Exception as error:  # a bug of ours: the caller needs to see where
+        except Exception as error:  # an internal error: the caller needs the traceback
             words = "".join(traceback.format_exception(error)).rstrip()
             pipe.send(("error", CosimError(f"internal error in the simulation's process:\n{words}")))
         return False

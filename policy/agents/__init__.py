@@ -33,21 +33,21 @@ TRAINABLE = ("vfn-p", "vfn", "safe-dqn", "conv3d-dqn", "conv3d-a2c", "conv2d-dqn
 
 
 def _made(module: str, kind: str, *arguments: str) -> Policy:
-    """A policy's class by name: its module (torch, compiled kernels) is imported when one is made."""
+    """A policy by class name. Its module (torch, compiled kernels) is imported on construction only."""
     made: Policy = getattr(importlib.import_module(f"policy.agents.{module}"), kind)(*arguments)
     return made
 
 
 POLICIES: dict[str, Callable[[], Policy]] = {
     "idm": partial(_made, "idm", "Idm"),
-    **{f"idm-{gap}": partial(_made, "idm", "IdmHeadway", gap) for gap in ("1.5", "2.2")},  # s of headway
+    **{f"idm-{gap}": partial(_made, "idm", "IdmHeadway", gap) for gap in ("1.5", "2.2")},  # time gap, s
     "idm-courteous": partial(_made, "idm", "IdmCourteous"),
     "keep-lane": partial(_made, "keep_lane", "KeepLane"),
     "car-alone": partial(_made, "car_alone", "CarAlone"),
     "random": partial(_made, "random", "Random"),
     "altruist-rule": partial(_made, "altruist_rule", "AltruistRule"),
     **{name: partial(_made, "prediction_aware", "PredictionAware", name) for name in APPROACHES},
-    "vfn-p-oracle": partial(_made, "oracle", "Oracle", "vfn-p"),  # its predictions come true
+    "vfn-p-oracle": partial(_made, "oracle", "Oracle", "vfn-p"),  # predicts from counterfactual rollouts
 }
 
 

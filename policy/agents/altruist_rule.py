@@ -1,7 +1,7 @@
-"""A scripted altruist: the AV best placed opens the gap for the mission vehicle, everybody else drives IDM.
+"""A scripted altruist: the best placed AV (the guide) opens a gap for the mission vehicle, others drive IDM.
 
-It shows what altruism can gain without learning anything (research/claims/altruism.yaml) and is the yardstick
-for the learned policies. AVs share what they know (V2V), so one guide is chosen for all of them.
+The rule shows the gain of altruism without learning (research/claims/altruism.yaml) and is the baseline of
+the learned policies. AVs share their observations (V2V), so they agree on one guide per mission vehicle.
 """
 
 from collections.abc import Mapping
@@ -9,42 +9,42 @@ from typing import NamedTuple
 
 from cosim.types import Decision, History, MetaAction, PolicyContext
 from policy.agents.idm import Idm, desired_gap
-from policy.inputs.meeting import CAR, LANE, Meeting, Seen, along, meet, missions
+from policy.inputs.conflict import CAR_LENGTH, LANE_WIDTH, Conflict, Seen, along, find_conflict, missions
 
 # When the guide yields and how much; m, m/s
-BEHIND_MIN = -5.0  # a guide this far ahead of the mission vehicle can still fall back
-BEHIND_MAX = 80.0  # further back its gap would come too late
-UPSTREAM_MIN = 60.0  # junctions: stopping at the line does not help, the gap opens upstream
-UPSTREAM_MAX = 260.0
-CRAWL = 2.0  # the guide waits upstream of a junction (on the grid: it stops)
-PACE_BELOW = 5.0  # beside an ending lane the guide drives this much slower than the other
-PACE_MIN = 5.0  # and never slower than this
-CLEAR = 10.0  # a free left lane: this much space ahead and behind,
-CLEAR_TIME = 0.8  # s of a follower's way on top,
-MAX_CLOSING = 3.0  # m/s that a follower there may be faster,
-CLOSING_TIME = 3.0  # s of what the two close in on each other
+MIN_LAG = -5.0  # a guide at most 5 m ahead of the mission vehicle can still fall back
+MAX_LAG = 80.0  # a guide further back would open the gap too late
+MIN_UPSTREAM = 60.0  # junctions: the gap must open upstream, not at the stop line
+MAX_UPSTREAM = 260.0
+CRAWL_SPEED = 2.0  # target speed of the guide upstream of a junction (on the grid: 0)
+PACE_SPEED_OFFSET = 5.0  # beside an ending lane: guide's speed below the mission vehicle's
+MIN_PACE_SPEED = 5.0  # lowest speed of the guide there
+MIN_CLEAR_GAP = 10.0  # a free left lane: space ahead and behind,
+CLEAR_TIME_GAP = 0.8  # s, plus this time gap to the follower,
+MAX_CLOSING_SPEED = 3.0  # m/s, largest speed of a follower above the guide's,
+CLOSING_TIME = 3.0  # s of closing speed added to the space
 
 
 class Need(NamedTuple):
-    """How one AV stands to the mission vehicle."""
+    """One AV's conflict with the mission vehicle."""
 
     av: str
-    meeting: Meeting
+    conflict: Conflict
 
 
 class AltruistRule(Idm):
-    """Left if the left lane is free, else slower; at junctions slower, far upstream."""
+    """The guide changes to a free left lane, else slows down; at junctions it slows down far upstream."""
 
     name = "altruist-rule"
 
     def reset(self, context: PolicyContext) -> None:
-        """A new episode: nobody has been served yet."""
+        """Start an episode: no mission vehicle has merged yet."""
         super().reset(context)
         self._served: set[str] = set()
         self._guide: dict[str, Need] = {}  # mission vehicle -> its guide
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
-        """At most one command per mission vehicle: the guide's."""
+        """At most one command per mission vehicle, to its guide."""
         decisions: dict[str, Decision] = {}
         needs: dict[str, list[Need]] = {}
         for mission, seen in missions(histories.values()).items():
@@ -64,49 +64,49 @@ class AltruistRule(Idm):
         return decisions
 
     def _need(self, av: str, history: History, mission: str, seen: Seen) -> Need | None:
-        """Whether this AV's way meets the mission vehicle's, and where; None when it does not."""
-        guide, meeting = self._guide.get(mission), meet(self.context.road, history, seen)
-        if guide is not None and self._is_served(guide, av, history, seen, meeting):
+        """Where this AV's path conflicts with the mission vehicle's; None without a conflict."""
+        guide, conflict = self._guide.get(mission), find_conflict(self.context.road, history, seen)
+        if guide is not None and self._merged(guide, av, history, seen, conflict):
             self._served.add(mission)
             return None
-        return None if meeting is None else Need(av, meeting)
+        return None if conflict is None else Need(av, conflict)
 
-    def _is_served(self, guide: Need, av: str, history: History, seen: Seen, meeting: Meeting | None) -> bool:
-        """Whether the mission vehicle drives where its guide meant it to: before it, or in the junction."""
+    def _merged(self, guide: Need, av: str, history: History, seen: Seen, conflict: Conflict | None) -> bool:
+        """Whether the mission vehicle has merged ahead of its guide or is inside the junction."""
         own = history.route.paths[1]
         if own is None or seen.lane < 0:
             return False
-        if guide.meeting.crossing:
+        if guide.conflict.crossing:
             return self.context.road.lanes[seen.lane].internal or seen.lane in own.lanes
-        return meeting is not None and guide.av == av and seen.lane in own.lanes[:3]
+        return conflict is not None and guide.av == av and seen.lane in own.lanes[:3]
 
     def _choose(self, mission: str, candidates: list[Need]) -> Need | None:
         present = {n.av: n for n in candidates}
         before = self._guide.get(mission)
         chosen = None if before is None else present.get(before.av)
         if chosen is not None and (
-            chosen.meeting.crossing or BEHIND_MIN <= chosen.meeting.behind <= 2 * BEHIND_MAX
+            chosen.conflict.crossing or MIN_LAG <= chosen.conflict.behind <= 2 * MAX_LAG
         ):
             return chosen
         fitting = [
             n
             for n in candidates
             if (
-                UPSTREAM_MIN <= n.meeting.behind <= UPSTREAM_MAX
-                if n.meeting.crossing
-                else BEHIND_MIN <= n.meeting.behind <= BEHIND_MAX
+                MIN_UPSTREAM <= n.conflict.behind <= MAX_UPSTREAM
+                if n.conflict.crossing
+                else MIN_LAG <= n.conflict.behind <= MAX_LAG
             )
         ]
-        return min(fitting, key=lambda n: n.meeting.behind, default=None)
+        return min(fitting, key=lambda n: n.conflict.behind, default=None)
 
     def _yield(self, need: Need, history: History) -> MetaAction | None:
-        """What the guide does; None: it is so close to its leader that IDM shall drive."""
-        if need.meeting.crossing:
-            wanted = CRAWL
+        """The guide's action; None when it is so close to its leader that IDM has to drive."""
+        if need.conflict.crossing:
+            wanted = CRAWL_SPEED
         else:
-            if need.meeting.from_right and self._left_is_free(history):
+            if need.conflict.from_right and self._left_is_free(history):
                 return MetaAction.LANE_LEFT
-            wanted = max(need.meeting.speed - PACE_BELOW, PACE_MIN)
+            wanted = max(need.conflict.speed - PACE_SPEED_OFFSET, MIN_PACE_SPEED)
         if history.lane_changing:
             return MetaAction.IDLE
         if history.target_speed > wanted + 2.5:
@@ -114,26 +114,26 @@ class AltruistRule(Idm):
         return None if self._too_close(history) else MetaAction.IDLE
 
     def _left_is_free(self, history: History) -> bool:
-        """Nobody there, nobody who would have to brake hard for us, nobody we would run into."""
+        """Whether the left lane has no vehicle beside the ego, no fast follower and no near leader."""
         speed = history.ego_speed
         left = history.route.paths[0]
         if left is None or history.route.to_end(0) < 100.0 or history.lane_changing:
             return False
-        for ahead, other in along(history, left, side=LANE):
-            if ahead < 0.0 and other - speed > MAX_CLOSING:
+        for ahead, other in along(history, left, side=LANE_WIDTH):
+            if ahead < 0.0 and other - speed > MAX_CLOSING_SPEED:
                 return False  # a guide that has slowed down already stays in its lane
-            behind = CLEAR + other * CLEAR_TIME + max(other - speed, 0.0) * CLOSING_TIME
-            front = CLEAR + max(speed - other, 0.0) * CLOSING_TIME
+            behind = MIN_CLEAR_GAP + other * CLEAR_TIME_GAP + max(other - speed, 0.0) * CLOSING_TIME
+            front = MIN_CLEAR_GAP + max(speed - other, 0.0) * CLOSING_TIME
             if -behind < ahead < front:
                 return False
         return True
 
     def _too_close(self, history: History) -> bool:
-        """Closer to a leader than IDM's own wish, even if the leader is getting away."""
+        """Whether the gap to the leader is below IDM's desired gap, even with a faster leader."""
         own, speed = history.route.paths[1], history.ego_speed
         if own is None:
             return False
         for ahead, other in along(history, own):
-            if ahead > 0.0 and ahead - CAR < 1.1 * desired_gap(speed, min(other, speed)):
+            if ahead > 0.0 and ahead - CAR_LENGTH < 1.1 * desired_gap(speed, min(other, speed)):
                 return True
         return False

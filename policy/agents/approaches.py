@@ -11,39 +11,39 @@ from cosim.types import COMPACT, PAPER, ObservationConfig
 from policy.agents import APPROACHES as APPROACHES
 from policy.chain.chain import ChainConfig
 from policy.checkpoint import SHIPPED, read_card
-from policy.inputs.tensors import APART_OF
+from policy.inputs.tensors import PLANE_CHANNELS
 from policy.networks.hpn import HpnConfig
 from policy.networks.vfn import TABLE_1, VfnConfig
 from policy.prediction.traffic import TrafficConfig
 from policy.safety import SafetyConfig
 
-# what stands for convolutions where a frozen encoder reads each frame: Conv3D sees time, Conv2D the present
+# extractor with a frozen encoder in place of convolutions: Conv3D reads all frames, Conv2D the newest one
 ENCODED: Mapping[str, Literal["frames", "frame"]] = {"conv3d": "frames", "conv2d": "frame"}
 
 
 @dataclass(frozen=True, slots=True)
 class AgentConfig:
-    """Everything that makes up one agent. Defaults: compact size, `vfn-p`."""
+    """The configuration of one agent. Defaults: compact size, `vfn-p`."""
 
     observation: ObservationConfig = COMPACT
     predicted_maps: bool = True  # False: the VFN sees the history only (Table III, `vfn`)
-    mask: bool = True  # False: no safety prioritizer, the best valued action is taken
+    mask: bool = True  # False: no safety prioritizer, the action of highest value is taken
     predictor: str = "gp-indirect"  # of the mask and of the chain's kinematics; `hold` for `vfn`
     chain: ChainConfig = field(default_factory=ChainConfig)
     hpn: HpnConfig = field(default_factory=HpnConfig)
     vfn: VfnConfig = field(default_factory=VfnConfig)
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     traffic: TrafficConfig = field(default_factory=TrafficConfig)
-    init_seed: int = 0  # of untrained weights: the same in every process
-    bf16: bool = False  # autocast; off, so that results do not depend on the processor
+    init_seed: int = 0  # seed of untrained weights, the same in every process
+    bf16: bool = False  # autocast; off, because its results depend on the processor
     vfn_weights: Path | None = None  # a checkpoint of policy.checkpoint; None: untrained
     hpn_weights: Path | None = None
-    note: str = ""  # goes into the label
+    note: str = ""  # part of the label
 
 
 def compact(name: str) -> AgentConfig:
-    """The compact configuration of an approach, with the weights that are shipped for it and, as their card
-    says it, the layout of its network and how its predicted maps are drawn."""
+    """The compact configuration of an approach with its shipped weights. The card of the weights gives the
+    layout of the network and the drawing of predicted maps."""
     weights = shipped(name)
     if weights is None:
         config = configure(name, COMPACT, ChainConfig(), HpnConfig(), VfnConfig())
@@ -57,23 +57,23 @@ def compact(name: str) -> AgentConfig:
 def paper(name: str) -> AgentConfig:
     """The paper-size configuration: 64 x 512, one frame a step, M = 20, T's Table 1 read literally."""
     config = configure(name, PAPER, ChainConfig(every=1), HpnConfig(), TABLE_1)
-    return replace(config, hpn_weights=shipped("hpn"))  # it knows vehicles, not pixels: one for all sizes
+    return replace(config, hpn_weights=shipped("hpn"))  # inputs are vehicles, not pixels: fits all sizes
 
 
 def configure(
     name: str, observation: ObservationConfig, chain: ChainConfig, hpn: HpnConfig, vfn: VfnConfig
 ) -> AgentConfig:
-    """The approach `name` at any size; the VFN's inputs follow from it.
+    """The approach `name` at any map size; the VFN's inputs follow from both.
 
-    Raises BadInput if it is unknown, or reads pixels of other channels than there are.
+    Raises BadInput for an unknown approach, or for map channels that its network cannot read.
     """
     if name not in APPROACHES:
         raise BadInput(f"no such approach ({', '.join(APPROACHES)})", field="policy", value=name)
     approach = APPROACHES[name]
     encoded = vfn.encoded
-    if (encoded or not approach.kinematics) and observation.channels != APART_OF:
+    if (encoded or not approach.kinematics) and observation.channels != PLANE_CHANNELS:
         how = "with an encoder reads" if encoded else "sees maps alone and reads"
-        problem = f"{name} {how} the channels {', '.join(APART_OF)}"
+        problem = f"{name} {how} the channels {', '.join(PLANE_CHANNELS)}"
         raise BadInput(problem, field="observation.channels", value=", ".join(observation.channels))
     return AgentConfig(
         observation=observation,
@@ -99,21 +99,21 @@ def configure(
 
 
 def vfn_of(card: Mapping[str, Any], file: Path) -> VfnConfig:
-    """The layout of the value network that the card `file` is of. Raises BadInput naming it and the field."""
+    """The layout of the value network described by the card `file`. Raises BadInput naming file and field."""
     return dataclass_from(VfnConfig, card["configs"].get("vfn", {}), file, "configs.vfn")
 
 
 def chain_of(card: Mapping[str, Any], file: Path) -> ChainConfig:
-    """How the maps were predicted that the network learned from. Raises BadInput as `vfn_of`."""
+    """The prediction of maps during training of the network. Raises BadInput as `vfn_of`."""
     return dataclass_from(ChainConfig, card["data"].get("chain", {}), file, "data.chain")
 
 
 def predictor_of(card: Mapping[str, Any], config: AgentConfig) -> str:
-    """What predicted the others for the mask that the network learned with."""
+    """The predictor behind the safety mask during training of the network."""
     return str(card["data"].get("predictor", config.predictor))
 
 
 def shipped(name: str) -> Path | None:
-    """The weights in the package; None while there are none."""
+    """The weights in the package; None if the package has none."""
     path = SHIPPED / f"{name}.safetensors"
     return path if path.is_file() else None

@@ -1,4 +1,4 @@
-"""AVs that always ask for more speed: with preset `lawful` all else is what the car does by itself."""
+"""AVs that always accelerate: with preset `lawful` the car controller alone does the rest."""
 
 from collections.abc import Mapping
 
@@ -7,7 +7,7 @@ from policy.agents.idm import Idm
 
 
 class CarAlone(Idm):
-    """Always Accelerate. What an agent adds to its car is the difference to this."""
+    """Always Accelerate. An agent's contribution is its difference from this baseline."""
 
     name = "car-alone"
 

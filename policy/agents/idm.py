@@ -1,33 +1,33 @@
-"""AVs that nobody commands: SUMO drives them, egoistic or with its default courtesy."""
+"""AVs without commands: SUMO drives them, egoistic or with its default courtesy."""
 
 import math
 from collections.abc import Mapping
 
 from cosim.types import Decision, History, ObservationConfig, PolicyContext
 
-# An AV as `idm` (presets.md, Policies):
-TIME_GAP, STANDSTILL, ACCEL, COMFORT = 0.8, 2.0, 3.0, 7.0  # s, m, m/s2, m/s2
+# IDM parameters of an AV under policy `idm` (presets.md, Policies):
+TIME_GAP, STANDSTILL_GAP, ACCEL, COMFORT_DECEL = 0.8, 2.0, 3.0, 7.0  # s, m, m/s2, m/s2
 
 
 def desired_gap(speed: float, leader_speed: float, time_gap: float = TIME_GAP) -> float:
-    """IDM's desired gap to its leader (P, section V-A.2).
+    """IDM's desired gap to the leader (P, section V-A.2).
 
     Args:
-        speed: own, m/s.
+        speed: of the follower, m/s.
         leader_speed: m/s.
         time_gap: s.
 
     Returns:
         m, bumper to bumper.
     """
-    closing = speed * (speed - leader_speed) / (2.0 * math.sqrt(ACCEL * COMFORT))
-    return STANDSTILL + max(speed * time_gap + closing, 0.0)
+    closing = speed * (speed - leader_speed) / (2.0 * math.sqrt(ACCEL * COMFORT_DECEL))
+    return STANDSTILL_GAP + max(speed * time_gap + closing, 0.0)
 
 
 class Idm:
-    """Egoistic IDM + LC2013 (presets.md, Policies): no cooperation of any kind. The baseline `idm`.
+    """Egoistic IDM + LC2013 without any cooperation (presets.md, Policies). The baseline `idm`.
 
-    Base of all policies that need no maps and leave SUMO's parameters as they are.
+    Base class of all policies without maps that keep SUMO's parameters.
     """
 
     name = "idm"
@@ -36,16 +36,16 @@ class Idm:
     av_parameters: Mapping[str, str] = {}
 
     def reset(self, context: PolicyContext) -> None:
-        """A new episode."""
+        """Start an episode."""
         self.context = context
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
-        """Nobody is commanded."""
+        """No AV is commanded."""
         return {}
 
 
 class IdmCourteous(Idm):
-    """The same with SUMO's own default courtesy (lcCooperative = 1 and its speed adaptation)."""
+    """`idm` with SUMO's default courtesy (lcCooperative = 1 and its speed adaptation)."""
 
     name = "idm-courteous"
     av_parameters: Mapping[str, str] = {
@@ -55,7 +55,7 @@ class IdmCourteous(Idm):
 
 
 class IdmHeadway(Idm):
-    """`idm` with a time headway of its own, s: more careful than 0.8 s, and as egoistic."""
+    """`idm` with another time gap, s: more careful than 0.8 s, and as egoistic."""
 
     def __init__(self, time_gap: str) -> None:
         self.name = f"idm-{time_gap}"

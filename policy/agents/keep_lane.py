@@ -1,4 +1,4 @@
-"""AVs that hold their lane and speed: without a safety check they show how hard the traffic is."""
+"""AVs that keep lane and speed without a safety check: a measure of how hard the traffic is."""
 
 from collections.abc import Mapping
 
@@ -7,7 +7,7 @@ from policy.agents.idm import Idm
 
 
 class KeepLane(Idm):
-    """Always Idle. Its crash rate stands beside C% so that the difficulty can be seen."""
+    """Always Idle. Its crash rate, reported beside C%, shows the difficulty of the scenario."""
 
     name = "keep-lane"
 

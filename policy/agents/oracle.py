@@ -1,4 +1,4 @@
-"""The fair oracle: an agent whose predictions are what really comes of everybody's present course."""
+"""The fair oracle: an agent with predictions taken from counterfactual rollouts of the simulation."""
 
 from collections.abc import Mapping, Sequence
 
@@ -12,18 +12,18 @@ from policy.prediction.forecast import KinematicForecast
 from policy.prediction.motion import Rollout
 from policy.prediction.traffic import Traffic, predict_traffic
 
-STATE = (X, Y, SPEED, HEADING)
+STATE_COLUMNS = (X, Y, SPEED, HEADING)
 
 
 class Oracle(PredictionAware):
-    """Drives by the same networks; the simulation itself says where everybody will be.
+    """The agent's networks with true future states, read from the simulation.
 
-    Fair: the AVs hold what they are commanded, and human errors that have not begun do not begin, as no
-    predictor can know of them. Predicted maps are drawn without the shading that stands for doubt.
+    Fair: in the rollout AVs keep their present commands, and no human error begins, because no predictor
+    can know of it. Predicted maps are drawn without the shading for uncertainty.
 
     Args:
         name: the approach.
-        config: its sizes and weights.
+        config: sizes and weights.
     """
 
     def __init__(
@@ -32,23 +32,23 @@ class Oracle(PredictionAware):
         config: AgentConfig | None = None,
     ) -> None:
         super().__init__(name, config)
-        if config is None:  # the one that ships
+        if config is None:  # the shipped one
             self.name = f"{name}-oracle"
-        self.hpn = None  # nothing is left to be corrected
+        self.hpn = None  # true states need no correction
 
     def looks_ahead(self, look: LookAhead) -> None:
         """See `cosim.types.LooksAhead`."""
         self._look = look
 
     def foresee(self, histories: Mapping[str, History]) -> tuple[Scene, Traffic, KinematicForecast]:
-        """What all AVs see together, and where the networks expect everybody in it."""
+        """The joined scene of all AVs and the forecast of its vehicles, as the networks receive them."""
         return self._truth(join(histories, self._context.pooled))
 
     def _truth(self, scene: Scene) -> tuple[Scene, Traffic, KinematicForecast]:
         c, context = self.config, self._context
         frames = max(c.chain.horizon, c.safety.frames)
         states = coming(scene, self._look(frames), context.timing.frame)
-        x, y, speed, heading = (states[:, : c.chain.horizon, k] for k in STATE)
+        x, y, speed, heading = (states[:, : c.chain.horizon, k] for k in STATE_COLUMNS)
         forecast = KinematicForecast.without_spread(x, y, speed, heading, scene.valid[:, -1])
         carried = predict_traffic(scene, forecast, context.road, c.traffic, c.safety.frames)
         traffic = carried._replace(rollout=_true(carried, scene, states[:, : c.safety.frames]))
@@ -59,7 +59,7 @@ class Oracle(PredictionAware):
 def coming(scene: Scene, frames: Sequence[Snapshot], dt: float) -> Floats:
     """States [V,M,4] (x m, y m, speed m/s, heading rad unwrapped) of the scene's vehicles in M frames.
 
-    Who has left the road goes straight on as it was seen last.
+    A vehicle that has left the road continues straight at its last speed.
     """
     out = np.empty((len(scene.vehicles), len(frames), 4))
     now = scene.state[:, -1, :4].copy()
@@ -77,7 +77,7 @@ def coming(scene: Scene, frames: Sequence[Snapshot], dt: float) -> Floats:
 
 
 def _true(carried: Traffic, scene: Scene, states: Floats) -> Rollout:
-    """The rollout [V,M+1] with the places and speeds of `states` [V,M,4] where vehicles are known."""
+    """The rollout [V,M+1] with positions and speeds of `states` [V,M,4] for known vehicles."""
     whole = np.concatenate([scene.state[:, -1:, :4], states], 1)
     known, old = carried.known[:, None], carried.rollout
     return old._replace(

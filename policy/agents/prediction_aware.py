@@ -36,11 +36,11 @@ from policy.prediction.traffic import Traffic, foresee
 from policy.safety import prioritize
 
 UNTRAINED = "untrained"
-RETRY = 2.0  # s, a lane change's time: so long a refused one is not tried again
+RETRY_DELAY = 2.0  # s, the duration of a lane change, before a refused lane change is tried again
 
 
 class Inputs(NamedTuple):
-    """What B AVs that decide together know and predict."""
+    """Observations and predictions of B AVs that decide together."""
 
     scene: Scene
     states: States
@@ -50,8 +50,8 @@ class Inputs(NamedTuple):
 class PredictionAware:
     """`cosim.types.Policy`: commands every AV.
 
-    The weights are seeded, so an untrained agent is the same everywhere; `label` says that it is untrained.
-    Decides for all AVs at once: prediction and action values in one batch, the prioritizer front to back.
+    Untrained weights are seeded, so an untrained agent is the same everywhere; `label` marks it as untrained.
+    All AVs decide at once: prediction and action values in one batch, then the prioritizer front to back.
     """
 
     def __init__(self, name: str = "vfn-p", config: AgentConfig | None = None) -> None:
@@ -69,7 +69,7 @@ class PredictionAware:
                 load(c.hpn_weights, {"hpn": self.hpn}, {"hpn": c.hpn})
         self.label = c.note or _label(parts)
         used = (*parts.values(), shipped(c.predictor))
-        self.files = tuple(path for path in used if path is not None)  # they decide how it drives
+        self.files = tuple(path for path in used if path is not None)  # weights that determine the behaviour
         self.vfn.to(memory_format=self.vfn.layout)  # type: ignore[call-overload]
         if self.hpn is not None:
             self.hpn.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -77,7 +77,7 @@ class PredictionAware:
         self._raster: RoadRaster | None = None
 
     def reset(self, context: PolicyContext) -> None:
-        """A new episode. Raises BadInput when the observation is not the one the networks were built for."""
+        """Start an episode. Raises BadInput when the observation does not match the networks."""
         if context.observation != self.observation:
             raise BadInput("the observation is not the one this agent needs", field="observation")
         for part, dt in (("safety", self.config.safety.dt), ("traffic", self.config.traffic.dt)):
@@ -92,7 +92,7 @@ class PredictionAware:
         self._context = context
         self._safety = replace(self.config.safety, assisted=context.preset == Preset.LAWFUL)
         self._expected: tuple[tuple[str, ...], Traffic, KinematicForecast] | None = None
-        self._asked: dict[str, tuple[MetaAction, float]] = {}  # lane changes commanded last, when (s)
+        self._asked: dict[str, tuple[MetaAction, float]] = {}  # AV -> last lane change commanded, at (s)
         self._memories: dict[VFN, FrameMemory | None] = {}
         self._predictor = make_predictor(
             self.config.predictor, self.config.chain.horizon, context.timing.frame
@@ -102,7 +102,7 @@ class PredictionAware:
         """One decision for every AV, each explained (P, figure 2; `cosim.types.Decision`).
 
         Args:
-            histories: AV -> what it has observed (`cosim.types.History`), all of the same instant.
+            histories: AV -> its observations (`cosim.types.History`), all of the same instant.
 
         Raises:
             FloatingPointError: the value network returned values that are not finite.
@@ -113,13 +113,13 @@ class PredictionAware:
         return self.choose(self.values(inputs), inputs)
 
     def perceive(self, histories: Mapping[str, History]) -> Inputs:
-        """Predict the next seconds: what the value network and the prioritizer work on (P, algorithm 1).
+        """Predict the next seconds: the inputs of value network and prioritizer (P, algorithm 1).
 
         Args:
-            histories: AV -> what it has observed.
+            histories: AV -> its observations.
 
         Returns:
-            scene of B AVs and V vehicles, the networks' states of the B AVs, the traffic of the V vehicles.
+            scene of B AVs and V vehicles, network states of the B AVs, predicted traffic of the V vehicles.
         """
         c, context = self.config, self._context
         scene, traffic, forecast = self.foresee(histories)
@@ -137,7 +137,7 @@ class PredictionAware:
         return Inputs(scene, States(maps, kinematics, known, svo_tensor(context.svo, len(known))), traffic)
 
     def encoded(self, inputs: Inputs) -> Inputs:
-        """With the latents [B,T,L] of the maps in their place, where the value network has an encoder."""
+        """Inputs with latents [B,T,L] in place of maps, if the value network has an encoder."""
         if not isinstance(self.vfn.maps, EncodedMaps):
             return inputs
         memory, states = self._memory(self.vfn), inputs.states
@@ -147,7 +147,7 @@ class PredictionAware:
         return inputs._replace(states=states._replace(maps=latents))
 
     def foresee(self, histories: Mapping[str, History]) -> tuple[Scene, Traffic, KinematicForecast]:
-        """What all AVs see together, and where everybody in it will be."""
+        """The joined scene of all AVs and the forecast of its vehicles."""
         c, context = self.config, self._context
         scene = join(histories, context.pooled)
         forecast, traffic = foresee(scene, self._predictor, context.road, c.traffic, c.safety.frames)
@@ -185,11 +185,11 @@ class PredictionAware:
         return self._memories[network]
 
     def choose(self, q: Floats32, inputs: Inputs) -> dict[str, Decision]:
-        """The safety prioritizer's choice (P, algorithm 3); without a mask the best valued action.
+        """The safety prioritizer's choice (P, algorithm 3); without a mask the action of highest value.
 
         Args:
             q: [B,A] action values, in the order of `inputs.scene.agents`.
-            inputs: what `perceive` gave.
+            inputs: as `perceive` returns them.
         """
         c, context, scene = self.config, self._context, inputs.scene
         if not c.mask:
@@ -208,12 +208,12 @@ class PredictionAware:
 
     @property
     def last_forecast(self) -> Forecast | None:
-        """Where the mask expected everybody at the last decision, before intentions were shared."""
+        """The mask's forecast of all vehicles at the last decision, before intentions were shared."""
         if self._expected is None:
             return None
         names, traffic, forecast = self._expected
         first = {name: row for row, name in reversed(list(enumerate(names))) if traffic.known[row]}
-        rows = np.array(list(first.values()), np.int64)  # without V2V a vehicle has a row per AV: its first
+        rows = np.array(list(first.values()), np.int64)  # without V2V a vehicle has a row per AV: the first
         m = min(forecast.x.shape[1], traffic.rollout.x.shape[1] - 1)
         out, ahead = traffic.rollout, slice(1, m + 1)
         return Forecast(
@@ -227,10 +227,10 @@ class PredictionAware:
         )
 
     def _refused(self, histories: Mapping[str, History]) -> dict[str, MetaAction]:
-        """Lane changes that were commanded within RETRY s and did not begin (a closed lane, a solid line)."""
+        """Lane changes commanded within RETRY_DELAY s that did not begin (a closed lane, a solid line)."""
         for name, history in histories.items():
             _, when = self._asked.get(name, (None, np.inf))
-            if history.lane_changing or history.time - when > RETRY:
+            if history.lane_changing or history.time - when > RETRY_DELAY:
                 self._asked.pop(name, None)
         return {name: action for name, (action, _) in self._asked.items() if name in histories}
 
@@ -242,7 +242,7 @@ def _networks(c: AgentConfig) -> tuple[VFN, HPN | None]:
 
 
 def _label(parts: Mapping[str, Path | None]) -> str:
-    """What to warn of: nothing, `untrained`, or which part is."""
+    """The label's warning: empty, `untrained`, or the untrained part."""
     missing = [part for part, weights in parts.items() if weights is None]
     which = "" if len(missing) == len(parts) else f" {', '.join(missing)}"
     return UNTRAINED + which if missing else ""

@@ -1,4 +1,4 @@
-"""AVs that draw their meta-action at random: the least that every policy must beat."""
+"""AVs with random meta-actions: the lower bound for every policy."""
 
 from collections.abc import Mapping
 

@@ -1,4 +1,4 @@
-"""The multi-step prediction chain (P, algorithm 1): all AVs' next seconds as maps and kinematics."""
+"""The multi-step prediction chain (P, algorithm 1): the next seconds of all AVs as maps and kinematics."""
 
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
@@ -21,15 +21,15 @@ from policy.prediction.vehicle_inputs import vehicle_inputs
 
 @dataclass(frozen=True, slots=True)
 class Hypotheses:
-    """What a training chooses of the prediction chain."""
+    """Options of the prediction chain in a training configuration."""
 
     every: int = 5  # the VFN takes every fifth frame, M = 4; paper: 1, M = 20
-    source: Literal["hpn", "gp_raster"] = "hpn"  # gp_raster: maps rendered from the forecast as it is
+    source: Literal["hpn", "gp_raster"] = "hpn"  # gp_raster: maps rendered from the uncorrected forecast
 
 
 @dataclass(frozen=True, slots=True)
 class ChainConfig(Hypotheses):
-    """How the next seconds are predicted (observation.md, Clocks)."""
+    """The prediction of the next seconds (observation.md, Clocks)."""
 
     horizon: int = 20  # frames of 0.2 s: 4 s (P, Table I)
 
@@ -39,7 +39,7 @@ class ChainConfig(Hypotheses):
 
     @property
     def hypotheses(self) -> int:
-        """M, the predicted frames that the VFN sees."""
+        """M, the number of predicted frames in the VFN's input."""
         return self.horizon // self.every
 
 
@@ -57,8 +57,8 @@ def render(rows: Floats, valid: Bools, pose: Floats, config: ObservationConfig, 
 
     Args:
         rows: [B,M,k,8] KINEMATIC_FEATURES in each ego's frame (m, m/s, rad), row 0 the ego.
-        valid: [B,k] which rows are vehicles.
-        pose: [B,3] x m, y m, heading rad of each ego now.
+        valid: [B,k] rows that hold a vehicle.
+        pose: [B,3] present x m, y m, heading rad of each ego.
         config: size and channels of the maps.
         raster: the road.
 
@@ -75,8 +75,8 @@ def render(rows: Floats, valid: Bools, pose: Floats, config: ObservationConfig, 
 def shade(rows: Floats, share: Floats) -> Floats:
     """Rows [B,M,k,8] (row 0 the ego) whose pixels are darkened to share [B,M,k] of their value.
 
-    A vehicle whose box is expected to be right by one half is drawn with half of its pixel value: the
-    expected picture, which has the least squared error. Never below PIXEL_LOWEST: no vehicle vanishes.
+    A vehicle with an expected overlap of one half is drawn with half of its pixel value: the expected
+    picture, which has the least squared error. The value stays above PIXEL_LOWEST, so no vehicle vanishes.
     """
     out = rows.copy()
     ego, top = rows[..., :1, SPEED], PIXEL_SPEED
@@ -100,14 +100,14 @@ def predict(
     """The next seconds of all AVs in one batch (P, algorithm 1).
 
     Args:
-        config: horizon and which of its frames are returned.
+        config: horizon and returned frames.
         observation: size and channels of the maps.
-        raster: the road as `cosim.geometry.raster.rasterize_road` gives it.
-        hpn: the network; None: the maps are rendered from the forecast as it is.
-        scene: what the AVs know (`policy.inputs.scene.join`).
-        batch: what they saw (`policy.inputs.tensors.to_batch`), on the device of the network.
-        forecast: states of all vehicles of `scene` in the world (m, m/s, rad), `horizon` frames at least.
-        traffic: the same speeds along the lanes, needed by a kinematic branch.
+        raster: the road from `cosim.geometry.raster.rasterize_road`.
+        hpn: the network; None: the maps are rendered from the uncorrected forecast.
+        scene: the AVs' joined knowledge (`policy.inputs.scene.join`).
+        batch: the AVs' observations (`policy.inputs.tensors.to_batch`), on the device of the network.
+        forecast: world states of all vehicles of `scene` (m, m/s, rad), at least `horizon` frames.
+        traffic: the same speeds along the lanes, required by a kinematic branch.
 
     Returns:
         maps, kinematics and rows of B AVs, M = horizon / every frames.
@@ -145,14 +145,14 @@ def _rendered(
     observation: ObservationConfig,
     raster: RoadRaster,
 ) -> Bytes:
-    """Maps [B,.,C,H,W] of the wanted frames, of the vehicles that each AV knows."""
+    """Maps [B,.,C,H,W] of the wanted frames, with the vehicles known to each AV."""
     x, y, speed, heading = (a[:, wanted] for a in states)
-    raster.show(scene.histories[0].signals)  # as they are now: their future is not known
+    raster.show(scene.histories[0].signals)  # present signal states: their future is unknown
     c = observation
     corner = 0.5 * float(np.hypot(c.height * c.metres_across, c.width * c.metres_along))  # m
-    rows, known, who = pictured(scene, x, y, speed, heading, corner + 1.0)
+    rows, known, index = pictured(scene, x, y, speed, heading, corner + 1.0)
     if corrected is not None:
-        share = corrected.share(who)[..., : states[0].shape[1]][..., wanted]  # [B,k,M]
+        share = corrected.share(index)[..., : states[0].shape[1]][..., wanted]  # [B,k,M]
         rows = shade(rows, share.transpose(0, 2, 1))
     return render(rows, known, scene.pose, observation, raster)
 
@@ -160,7 +160,7 @@ def _rendered(
 def _chain(
     branch: MapBranch, config: ChainConfig, batch: Batch, kinematics: torch.Tensor, rendered: Bytes | None
 ) -> torch.Tensor:
-    """The map branch, block after block: its own maps and the forecast kinematics are its next past."""
+    """The map branch, block after block: its maps and the forecast kinematics are the next block's past."""
     m, device = config.horizon, batch.maps.device
     n, block, channels = branch.config.seen, branch.config.block, batch.maps.shape[2]
     b, _, _, h, w = batch.maps.shape
@@ -175,7 +175,7 @@ def _chain(
             if ahead.shape[1] < block:  # the horizon ends within this block
                 ahead = np.concatenate([ahead, np.repeat(ahead[:, -1:], block - ahead.shape[1], 1)], 1)
             drawn = _grouped(torch.from_numpy(ahead).to(device))
-        guess, _ = branch(past, moved, drawn)  # its own K is replaced by the GP's (eq. 10)
+        guess, _ = branch(past, moved, drawn)  # the branch's K is replaced by the GP's (eq. 10)
         guess = guess.clamp_(0.0, 1.0)
         frames = guess.view(b, block, channels, h, w)
         guesses += [frames[:, k] for k in range(block) if (start + k + 1) % config.every == 0]

@@ -16,10 +16,10 @@ from policy.prediction.predictors import Predictor
 from policy.prediction.traffic import TrafficConfig, foresee
 from policy.prediction.vehicle_inputs import vehicle_inputs
 
-PAINTED = 8  # features shown of each layer: those that differ most
+SHOWN_FEATURES = 8  # features shown per layer, those of largest variance
 
 
-def painted(
+def feature_pictures(
     hpns: Mapping[str, HPN],
     histories: Mapping[str, History],
     av: str,
@@ -27,10 +27,10 @@ def painted(
     road: RoadMap,
     predictor: Predictor,
 ) -> dict[str, Floats32]:
-    """Layer -> pictures [k,h,w] in [0,1] as the AV `av` sees them.
+    """Layer -> pictures [k,h,w] in [0,1] in the frame of the AV `av`.
 
-    Features of the map branch are pictures already. Those of the kinematic branch belong to vehicles: each
-    vehicle is drawn where it is now, as bright as its feature.
+    Features of the map branch are pictures already. Features of the kinematic branch belong to vehicles: each
+    vehicle is drawn at its present position with its feature as brightness.
     """
     scene = join(histories, observation.share_perception)
     b = scene.agents.index(av)
@@ -42,7 +42,7 @@ def painted(
                 inputs = vehicle_inputs(known, *foresee(known, predictor, road, TrafficConfig()))
                 features = hpn.kinematic.features(torch.from_numpy(inputs.own), torch.from_numpy(inputs.near))
                 values = to_numpy(features) * inputs.known[:, None]
-                out[f"{name}, vehicles"] = _on_the_road(values, scene, b, observation, road)
+                out[f"{name}, vehicles"] = _vehicle_pictures(values, scene, b, observation, road)
             if hpn.map_branch is not None and not hpn.map_branch.config.correct:
                 seen = to_batch(scene.histories).maps[b : b + 1, -hpn.map_branch.config.seen :]
                 for layer, maps in enumerate(hpn.map_branch.encode(unit(seen).flatten(1, 2))[1]):
@@ -50,11 +50,11 @@ def painted(
     return out
 
 
-def _on_the_road(
+def _vehicle_pictures(
     values: Floats32, scene: Scene, b: int, observation: ObservationConfig, road: RoadMap
 ) -> Floats32:
-    """[k,H,W]: the liveliest features [V,.], each vehicle drawn with its own."""
-    chosen = np.argsort(-values.std(0))[:PAINTED]
+    """[k,H,W]: the features [V,.] of largest variance, drawn at the vehicles."""
+    chosen = np.argsort(-values.std(0))[:SHOWN_FEATURES]
     now = scene.state[:, -1]
     x, y, heading = (now[:, k : k + 1] for k in (0, 1, 3))
     raster = rasterize_road(road)
@@ -64,7 +64,7 @@ def _on_the_road(
         speed: Floats = 60.0 * level[:, None].astype(np.float64) - 30.0  # the rasteriser's brightness
         rows, known, _ = pictured(scene, x, y, speed, heading)
         ego = rows[b : b + 1].copy()
-        ego[..., 0, 2] = 0.0  # brightness is the speed against the ego's
+        ego[..., 0, 2] = 0.0  # brightness encodes the speed relative to the ego
         maps = render(ego, known[b : b + 1], scene.pose[b : b + 1], observation, raster)[0, 0]
         road_channel = observation.channels.index("road")
         vehicles = np.delete(maps, road_channel, 0).max(0).astype(np.float32) / 255.0
@@ -73,7 +73,7 @@ def _on_the_road(
 
 
 def _scaled(maps: Floats32) -> Floats32:
-    """The PAINTED features [k,h,w] that vary most over the picture, each from 0 to 1."""
-    most = maps[np.argsort(-maps.std((1, 2)))[:PAINTED]]
+    """The SHOWN_FEATURES features [k,h,w] of largest variance over the picture, each from 0 to 1."""
+    most = maps[np.argsort(-maps.std((1, 2)))[:SHOWN_FEATURES]]
     low, high = most.min((1, 2), keepdims=True), most.max((1, 2), keepdims=True)
     return np.asarray((most - low) / np.maximum(high - low, 1e-9), np.float32)

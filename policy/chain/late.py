@@ -1,4 +1,4 @@
-"""Late states of vehicles predicted to now by the HPN's kinematic branch, each AV by what it knows alone."""
+"""Delay compensation by the HPN's kinematic branch: late states are predicted to now, for each AV alone."""
 
 import numpy as np
 import torch
@@ -14,17 +14,17 @@ from policy.prediction.forecast import KinematicForecast
 from policy.prediction.gp import GaussianProcessIndirect
 from policy.prediction.motion import Rollout
 from policy.prediction.traffic import Traffic, TrafficConfig, foresee
-from policy.prediction.vehicle_inputs import FRAME, VehicleInputs, vehicle_inputs
+from policy.prediction.vehicle_inputs import FRAME_S, VehicleInputs, vehicle_inputs
 
-LEAST_FRAMES = 5  # of a past that the branch may correct: on shorter ones it was hardly trained
+MIN_FRAMES = 5  # shortest past that the branch corrects: training had few shorter ones
 
 
 class LateStates:
-    """The shipped HPN on tracks. Raises BadInput where a frame is not the one it was trained with."""
+    """The shipped HPN on tracks. Raises BadInput for another frame time than in training."""
 
     def __init__(self, road: RoadMap, timing: Timing) -> None:
-        if abs(timing.frame - FRAME) > 1e-9:
-            problem = f"the HPN was trained with frames of {FRAME:g} s"
+        if abs(timing.frame - FRAME_S) > 1e-9:
+            problem = f"the HPN was trained with frames of {FRAME_S:g} s"
             raise BadInput(problem, field="compensation", value=f"hpn with frames of {timing.frame:g} s")
         hpn = HPN(HpnConfig())
         load(SHIPPED / "hpn.safetensors", {"hpn": hpn}, {"hpn": hpn.config})
@@ -34,9 +34,9 @@ class LateStates:
         self._predictor = GaussianProcessIndirect(hpn.kinematic.config.horizon, timing.frame)
 
     def ahead(self, tracks: Tracks) -> KinematicForecast:
-        """[V,M] the states after those of `tracks`.
+        """[V,M] the states that follow those of `tracks`.
 
-        Of persons, and of those known for too short a time, the Gaussian process's along the lanes.
+        Persons and tracks shorter than MIN_FRAMES get the Gaussian process's forecast along the lanes.
         """
         scene = _scene(tracks)
         forecast, traffic = foresee(scene, self._predictor, self._road, self._config)
@@ -44,7 +44,7 @@ class LateStates:
         with torch.inference_mode():
             corrected = apply(self._branch, inputs, forecast).forecast
         lane = inputs.lane[:, : corrected.x.shape[1]]
-        uncorrected = (tracks.person | (tracks.valid.sum(1) < LEAST_FRAMES))[:, None]
+        uncorrected = (tracks.person | (tracks.valid.sum(1) < MIN_FRAMES))[:, None]
         names = ("x", "y", "speed", "heading")
         x, y, speed, heading = (
             np.where(uncorrected, lane[..., k], getattr(corrected, n)) for k, n in enumerate(names)
@@ -53,7 +53,7 @@ class LateStates:
 
 
 def _scene(tracks: Tracks) -> Scene:
-    """All tracks as one scene, which nobody looks at."""
+    """All tracks as one scene without a deciding AV."""
     count, frames = tracks.valid.shape
     state = np.zeros((count, frames, 8))
     state[..., :4] = np.nan_to_num(tracks.state)
@@ -68,7 +68,7 @@ def _scene(tracks: Tracks) -> Scene:
 def _inputs_by_owner(
     scene: Scene, forecast: KinematicForecast, traffic: Traffic, tracks: Tracks
 ) -> VehicleInputs:
-    """The branch's inputs, where neighbours are tracks of the same AV; persons are nobody's."""
+    """The branch's inputs. Neighbours are tracks of the same AV; persons are no neighbours."""
     parts = []
     order = np.argsort(tracks.owner, kind="stable")
     for rows in np.split(order, np.flatnonzero(np.diff(tracks.owner[order])) + 1):

@@ -1,4 +1,4 @@
-"""How far predicted maps are from what followed: PRE and occupancy IoU (observation.md)."""
+"""Error of predicted maps against the true ones: PRE and occupancy IoU (observation.md)."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -22,12 +22,12 @@ HORIZONS = (0.2, 0.4, 1.0, 2.0, 3.0, 4.0)  # s (observation.md, Clocks)
 
 
 def frame_of(horizon: float, dt: float = 0.2) -> int:
-    """Place of a horizon (s) among the predicted frames."""
+    """Index of a horizon (s) among the predicted frames."""
     return round(horizon / dt) - 1
 
 
 def vehicle_channels(config: ObservationConfig) -> npt.NDArray[np.int64]:
-    """Channels that show vehicles: all but the road."""
+    """Channels that show vehicles: all except the road."""
     return np.array([k for k, name in enumerate(config.channels) if name != "road"], np.int64)
 
 
@@ -36,7 +36,7 @@ def picture_error(
 ) -> tuple[Floats, Floats]:
     """PRE (mean squared error per vehicle pixel) and IoU of maps [...,C,H,W]; uint8 counts as 255 = 1.
 
-    Two empty maps agree: their IoU is 1.
+    The IoU of two empty maps is 1.
     """
     axes = (-3, -2, -1)
     p, t = (unit_maps(a[..., channels, :, :]) for a in (predicted, true))
@@ -60,9 +60,9 @@ class Guess(NamedTuple):
 
 
 class MapPredictors:
-    """The predictors of the table: repeating the last frame, the rendered forecast, and trained HPNs.
+    """The predictors of the table: repetition of the last frame, the rendered forecast, and trained HPNs.
 
-    `predictor` forecasts for all of them; an HPN without history gets the forecast of the newest frame alone.
+    All use the forecast of `predictor`; an HPN without history gets the forecast of the newest frame alone.
     """
 
     def __init__(

@@ -1,1 +1,1 @@
-"""What the networks and rules are given: the joined scene, situation, meetings, tensors."""
+"""Inputs of networks and rules: the joined scene, situation, mission conflicts, tensors."""

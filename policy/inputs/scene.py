@@ -1,4 +1,4 @@
-"""What all AVs perceive: every vehicle once, in world coordinates, with the rows that refer to it."""
+"""The joined scene of all AVs: every vehicle once, in world coordinates, with the rows that refer to it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from cosim.types import (
 
 
 class Scene(NamedTuple):
-    """B deciding AVs and the V vehicles that any of them knows."""
+    """B deciding AVs and the V vehicles known to any of them."""
 
     agents: tuple[str, ...]  # [B] sorted by id
     histories: tuple[History, ...]  # [B]
@@ -41,11 +41,11 @@ class Scene(NamedTuple):
 
     @property
     def ego(self) -> Ints:
-        """[B] each AV's place among the vehicles."""
+        """[B] index of each AV among the vehicles."""
         return np.asarray(self.row[:, 0])
 
     def without_history(self) -> Scene:
-        """The same as known from the newest frame alone (P, figure 6: without history)."""
+        """The scene with the newest frame only (P, figure 6: without history)."""
         valid = self.valid.copy()
         valid[:, :-1] = False
         return self._replace(valid=valid)
@@ -55,8 +55,8 @@ def join(histories: Mapping[str, History], share: bool = True) -> Scene:
     """Join the histories of AVs that decide together.
 
     Args:
-        histories: AV -> what it has observed.
-        share: V2V, the AVs' knowledge of a vehicle is pooled; otherwise each keeps its own copy of it.
+        histories: AV -> its observations.
+        share: V2V, the AVs' knowledge of a vehicle is pooled; otherwise each AV keeps its own copy.
     """
     agents = tuple(sorted(histories))
     each = tuple(histories[a] for a in agents)
@@ -71,7 +71,7 @@ def join(histories: Mapping[str, History], share: bool = True) -> Scene:
             k = rows[b, r] = found.setdefault((name, "" if share else agents[b]), len(found))
             if k == len(source):
                 source.append((b, r))
-    of, row = np.array(source, np.int64).T  # [V] the AV that perceives each vehicle, and the row it has there
+    of, row = np.array(source, np.int64).T  # [V] the perceiving AV and its row for each vehicle
     return Scene(
         agents,
         each,
@@ -87,7 +87,7 @@ def join(histories: Mapping[str, History], share: bool = True) -> Scene:
 
 
 def to_world(kinematics: Floats32 | Floats, pose: Floats) -> Floats:
-    """[B,N,R,8] in each ego's frame, pose [B,3] -> the same in the world (m, m/s, rad)."""
+    """[B,N,R,8] in each ego's frame, pose [B,3] -> [B,N,R,8] in the world (m, m/s, rad)."""
     world = kinematics.astype(np.float64)
     c, s = np.cos(pose[:, 2])[:, None, None], np.sin(pose[:, 2])[:, None, None]
     x, y = world[..., X].copy(), world[..., Y].copy()
@@ -100,25 +100,25 @@ def to_world(kinematics: Floats32 | Floats, pose: Floats) -> Floats:
 def rows_ahead(scene: Scene, x: Floats, y: Floats, speed: Floats, heading: Floats) -> tuple[Floats, Bools]:
     """Predicted vehicles as kinematic rows. x, y, speed, heading [V,M] in the world.
 
-    Returns rows [B,M,R,8] in each ego's frame at the newest frame (m, m/s, rad) and who has one [B,R].
+    Returns rows [B,M,R,8] in each ego's frame at the newest frame (m, m/s, rad) and their validity [B,R].
     """
     known = (scene.row >= 0) & scene.valid[np.maximum(scene.row, 0), -1]  # [B,R]
-    who = np.maximum(scene.row, 0)
-    # headings of one vehicle continue its own history row: the same multiple of 2 pi
+    index = np.maximum(scene.row, 0)
+    # headings continue the vehicle's history row: the same multiple of 2 pi
     base = (
-        np.stack([h.kinematics[-1, :, HEADING] for h in scene.histories]) - scene.state[who, -1, HEADING]
+        np.stack([h.kinematics[-1, :, HEADING] for h in scene.histories]) - scene.state[index, -1, HEADING]
     )  # [B,R]
-    return _rows(scene, who, known, base, (x, y, speed, heading)), known
+    return _rows(scene, index, known, base, (x, y, speed, heading)), known
 
 
 def pictured(
     scene: Scene, x: Floats, y: Floats, speed: Floats, heading: Floats, reach: float = np.inf
 ) -> tuple[Floats, Bools, Ints]:
-    """The same of the vehicles an AV knows, row 0 the ego: what its predicted maps are drawn from.
+    """Rows of the vehicles known to an AV, row 0 the ego, for drawing its predicted maps.
 
-    Left out is who stays further than `reach` m (and its own length) from the ego in every frame.
+    Vehicles further than `reach` m (plus their length) from the ego in every frame are left out.
 
-    Returns rows [B,M,k,8], which of them hold a vehicle [B,k] and which vehicle of the scene each is [B,k].
+    Returns rows [B,M,k,8], their validity [B,k] and the index of each vehicle in the scene [B,k].
     """
     owned = np.ones((1, 1), np.bool_)
     if not scene.shared:
@@ -126,55 +126,55 @@ def pictured(
         for mine, row in zip(owned, scene.row, strict=True):
             mine[row[row >= 0]] = True
     size = scene.state[:, -1, LENGTH] + scene.state[:, -1, WIDTH]
-    who, known = _near(scene.ego, scene.valid[:, -1], owned, x, y, size, reach)
-    base = np.repeat(-scene.pose[:, 2:3], who.shape[1], 1)
-    return _rows(scene, who, known, base, (x, y, speed, heading)), known, who
+    index, known = _near(scene.ego, scene.valid[:, -1], owned, x, y, size, reach)
+    base = np.repeat(-scene.pose[:, 2:3], index.shape[1], 1)
+    return _rows(scene, index, known, base, (x, y, speed, heading)), known, index
 
 
 @compiled
 def _near(
     ego: Ints,  # [B]
     valid: Bools,  # [V]
-    owned: Bools,  # [B,V] whom each ego knows; [1,1]: all know all
+    owned: Bools,  # [B,V] vehicles known to each ego; [1,1]: all
     x: Floats,  # [V,M] m
     y: Floats,  # [V,M] m
     size: Floats,  # [V] m
     reach: float,  # m
 ) -> tuple[Ints, Bools]:
-    """Whom each ego pictures [B,k], itself first and 0 beyond its last one, and where there is one [B,k]."""
+    """Vehicles drawn for each ego [B,k], the ego first, padded with 0, and their validity [B,k]."""
     count, vehicles, frames = ego.shape[0], x.shape[0], x.shape[1]
-    who, known = np.zeros((count, vehicles), np.int64), np.zeros((count, vehicles), np.bool_)
+    index, known = np.zeros((count, vehicles), np.int64), np.zeros((count, vehicles), np.bool_)
     most = 1
     for b in range(count):
         e, n = ego[b], 1
-        who[b, 0], known[b, 0] = e, valid[e]
+        index[b, 0], known[b, 0] = e, valid[e]
         for j in range(1, vehicles):
-            v = 0 if j == e else j  # the ego and the first one change places
+            v = 0 if j == e else j  # the ego and the first vehicle swap places
             if not valid[v] or (owned.shape[1] > 1 and not owned[b, v]):
                 continue
             limit = (reach + size[v]) ** 2
             for k in range(frames):
-                if not (x[v, k] - x[e, k]) ** 2 + (y[v, k] - y[e, k]) ** 2 > limit:  # so is who is nan
-                    who[b, n], known[b, n] = v, True
+                if not (x[v, k] - x[e, k]) ** 2 + (y[v, k] - y[e, k]) ** 2 > limit:  # true for nan too
+                    index[b, n], known[b, n] = v, True
                     n += 1
                     break
         most = max(most, n)
-    return who[:, :most].copy(), known[:, :most].copy()
+    return index[:, :most].copy(), known[:, :most].copy()
 
 
 def _rows(
-    scene: Scene, who: Ints, known: Bools, base: Floats, states: tuple[Floats, Floats, Floats, Floats]
+    scene: Scene, index: Ints, known: Bools, base: Floats, states: tuple[Floats, Floats, Floats, Floats]
 ) -> Floats:
-    """[B,M,k,8] of the vehicles who [B,k]; base [B,k] rad is added to their headings."""
+    """[B,M,k,8] of the vehicles `index` [B,k]; `base` [B,k] rad is added to their headings."""
     x, y, speed, heading = states
-    rows = np.zeros((len(who), x.shape[1], who.shape[1], len(KINEMATIC_FEATURES)))
-    dx = x[who] - scene.pose[:, 0, None, None]  # [B,k,M]
-    dy = y[who] - scene.pose[:, 1, None, None]
+    rows = np.zeros((len(index), x.shape[1], index.shape[1], len(KINEMATIC_FEATURES)))
+    dx = x[index] - scene.pose[:, 0, None, None]  # [B,k,M]
+    dy = y[index] - scene.pose[:, 1, None, None]
     c, s = np.cos(scene.pose[:, 2])[:, None, None], np.sin(scene.pose[:, 2])[:, None, None]
     rows[..., X] = (c * dx + s * dy).transpose(0, 2, 1)
     rows[..., Y] = (c * dy - s * dx).transpose(0, 2, 1)
-    rows[..., SPEED] = speed[who].transpose(0, 2, 1)
-    rows[..., HEADING] = (heading[who] + base[..., None]).transpose(0, 2, 1)
-    rows[..., 4:] = scene.state[who, -1, 4:][:, None]
+    rows[..., SPEED] = speed[index].transpose(0, 2, 1)
+    rows[..., HEADING] = (heading[index] + base[..., None]).transpose(0, 2, 1)
+    rows[..., 4:] = scene.state[index, -1, 4:][:, None]
     rows *= known[:, None, :, None]
     return rows

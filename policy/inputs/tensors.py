@@ -1,4 +1,4 @@
-"""The only crossing between numpy and torch: histories in, network inputs out, action values back."""
+"""The only conversion between numpy and torch: histories in, network inputs out, action values back."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -13,25 +13,25 @@ from cosim.types import KINEMATIC_FEATURES, Bools, Bytes, Floats, Floats32, Hist
 from policy.inputs.situation import situation
 
 # Scales that bring every kinematic feature to about [-1, 1]: row range, map half width, motorway speed,
-# a U-turn, a lorry; is_av and is_mission stay.
+# a U-turn, a lorry; is_av and is_mission are not scaled.
 KINEMATIC_SCALE = np.array([125.0, 16.0, 30.0, np.pi, 10.0, 3.0, 1.0, 1.0], np.float32)
 KINEMATIC_INPUTS = len(KINEMATIC_FEATURES) + 1  # the features and the mask
 
-APART_OF = ("av", "hv", "road", "mission")  # channels that `apart` reads
-APART = 5  # channels of `apart`: AV, HV, road, ego or mission vehicle, relative speed
-STILL = 255 * (PIXEL_LOWEST + PIXEL_SPAN / 2)  # pixel of a vehicle as fast as the ego
+PLANE_CHANNELS = ("av", "hv", "road", "mission")  # channels that `to_planes` reads
+PLANES = 5  # channels of `to_planes`: AV, HV, road, ego or mission vehicle, relative speed
+EQUAL_SPEED_PIXEL = 255 * (PIXEL_LOWEST + PIXEL_SPAN / 2)  # pixel value of a vehicle at the ego's speed
 _LEVEL = np.float32(1.0 / 255.0)
-BRISK = 255 * PIXEL_SPAN / (2 * PIXEL_SPEED) * 15.0  # what 15 m/s of relative speed add to it: 1 in `apart`
-# [256] relative speed, in 15 m/s, of a vehicle's pixel; 0 of none
+PIXEL_PER_15_MPS = 255 * PIXEL_SPAN / (2 * PIXEL_SPEED) * 15.0  # 1.0 in `to_planes`
+# [256] pixel value -> relative speed in units of 15 m/s; 0 for pixels without a vehicle
 _RELATIVE = np.where(
     np.arange(256) > 0,
-    (np.arange(256, dtype=np.float32) - np.float32(STILL)) * np.float32(1.0 / BRISK),
+    (np.arange(256, dtype=np.float32) - np.float32(EQUAL_SPEED_PIXEL)) * np.float32(1.0 / PIXEL_PER_15_MPS),
     np.float32(0.0),
 )
 
 
 class States(NamedTuple):
-    """What a value network takes of B AVs; T = N past and M predicted frames."""
+    """Inputs of a value network for B AVs; T = N past and M predicted frames."""
 
     maps: torch.Tensor  # [B,T,C,H,W] uint8 pixels: bytes until a convolution reads them
     kinematics: torch.Tensor  # [B,T,R,F+1] scaled
@@ -40,14 +40,14 @@ class States(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """What B AVs see."""
+    """Observations of B AVs."""
 
     maps: torch.Tensor  # [B,N,C,H,W] uint8 pixels: bytes until a convolution reads them
     kinematics: torch.Tensor  # [B,N,R,F+1] float32, scaled, the mask last; zeros in masked rows
 
 
 def to_batch(histories: Sequence[History], device: str = "cpu") -> Batch:
-    """What AVs that decide together see, as the networks take it."""
+    """Observations of AVs that decide together, as network inputs."""
     maps = np.stack([h.velocity_map for h in histories])
     kinematics = np.stack([h.kinematics for h in histories])
     valid = np.stack([h.valid for h in histories])
@@ -57,7 +57,7 @@ def to_batch(histories: Sequence[History], device: str = "cpu") -> Batch:
 def situation_tensor(
     histories: Sequence[History], road: RoadMap, shared: bool, device: str = "cpu"
 ) -> torch.Tensor:
-    """What they know besides [B,SITUATION_INPUTS]: `policy.inputs.situation`."""
+    """Their situation [B,SITUATION_INPUTS]: `policy.inputs.situation`."""
     return torch.from_numpy(situation(histories, road, shared)).to(device)
 
 
@@ -76,7 +76,7 @@ def unit(maps: torch.Tensor) -> torch.Tensor:
 
 
 def pixels(maps: torch.Tensor) -> torch.Tensor:
-    """The inverse of `unit`, rounded: what a recording keeps of maps."""
+    """The inverse of `unit`, rounded, for recordings."""
     return (maps * 255.0 + 0.5).to(torch.uint8) if maps.is_floating_point() else maps
 
 
@@ -94,27 +94,27 @@ def to_numpy(values: torch.Tensor) -> Floats32:
     return np.asarray(values.detach().to("cpu", torch.float32).numpy(), np.float32)
 
 
-def apart(maps: torch.Tensor) -> torch.Tensor:
-    """Maps [B,4,H,W] of the channels APART_OF, as bytes -> [B,5,H,W]: who is where, how fast.
+def to_planes(maps: torch.Tensor) -> torch.Tensor:
+    """Maps [B,4,H,W] of the channels PLANE_CHANNELS, as bytes -> [B,5,H,W]: occupancy and relative speed.
 
-    A pixel's brightness says both at once, and 5 m/s more is a shade brighter: convolutions find it sooner
-    where a vehicle is 1 whatever its speed, and relative speed stands in a channel of its own.
+    A map's brightness encodes presence and speed at once, and 5 m/s change it little. Separate channels
+    train faster: presence is 1 at any speed, and relative speed has its own channel.
     """
     if maps.device.type != "cpu":
         present = maps.clamp(max=1).to(torch.float32)
         speed = torch.from_numpy(_RELATIVE).to(maps.device)[torch.maximum(maps[:, 0], maps[:, 1]).long()]
         return torch.cat([present, speed[:, None]], 1)
-    planes = np.empty((len(maps), *maps.shape[2:], APART), np.float32)
-    _apart(maps.numpy(), planes)
+    planes = np.empty((len(maps), *maps.shape[2:], PLANES), np.float32)
+    _fill_planes(maps.numpy(), planes)
     return torch.from_numpy(planes).permute(0, 3, 1, 2)
 
 
 @compiled
-def _apart(maps: Bytes, planes: Floats32) -> None:
-    """Fills `planes` [B,H,W,APART], channels last as convolutions read them, in one pass over memory."""
+def _fill_planes(maps: Bytes, planes: Floats32) -> None:
+    """Fills `planes` [B,H,W,PLANES], channels last as convolutions read them, in one pass over memory."""
     for b in range(planes.shape[0]):
         for y in range(planes.shape[1]):
             for x in range(planes.shape[2]):
-                for c in range(APART - 1):
+                for c in range(PLANES - 1):
                     planes[b, y, x, c] = 1.0 if maps[b, c, y, x] else 0.0
                 planes[b, y, x, 4] = _RELATIVE[max(maps[b, 0, y, x], maps[b, 1, y, x])]

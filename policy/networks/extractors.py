@@ -1,4 +1,4 @@
-"""What turns a stack of maps into features: T's Conv3D (Table 1), frame by frame, or all as one picture."""
+"""Feature extractors of map stacks: T's Conv3D (Table 1), an encoder per frame, or Conv2D over all frames."""
 
 from collections.abc import Callable, Sequence
 from typing import Literal
@@ -9,11 +9,11 @@ from torch import nn
 from torch.nn import functional
 
 from cosim.types import Bytes, Floats32
-from policy.inputs.tensors import APART, apart, to_numpy, unit
+from policy.inputs.tensors import PLANES, to_numpy, to_planes, unit
 from policy.networks.frame_encoder import EncoderConfig, FrameEncoder
 
 Strides = Literal["literal", "temporal"]
-Read = Callable[[torch.Tensor], torch.Tensor]  # maps [B,C,H,W] -> the channels that are convolved, float32
+Read = Callable[[torch.Tensor], torch.Tensor]  # maps [B,C,H,W] -> input channels of the convolution, float32
 
 # T gives no strides: two readings. `literal` has no padding, `temporal` halves time too.
 STRIDES: dict[str, tuple[tuple[int, int, int], ...]] = {
@@ -43,7 +43,7 @@ class Conv3dMaps(nn.Module):
         layers: list[nn.Conv3d] = []
         for k, (stride, wanted) in enumerate(zip(STRIDES[strides], KERNELS, strict=True)):
             padding = tuple((n - 1) // 2 if strides == "temporal" else 0 for n in wanted)
-            # a kernel never reaches beyond its (padded) input at the smaller sizes
+            # at small map sizes a kernel must not exceed its (padded) input
             kernel = tuple(min(n, s + 2 * p) for n, s, p in zip(wanted, shape, padding, strict=True))
             layers.append(nn.Conv3d(widths[k], widths[k + 1], kernel, stride, padding))  # type: ignore[arg-type]
             shape = tuple(
@@ -53,15 +53,15 @@ class Conv3dMaps(nn.Module):
         self.flat = features[2] * shape[0] * shape[1] * shape[2]
 
     def forward(self, maps: torch.Tensor) -> torch.Tensor:
-        """Fastest with the weights in channels_last_3d."""
+        """Features [B,flat]. Fastest with the weights in channels_last_3d."""
         b, t = maps.shape[:2]
         z = self.frames(maps.flatten(0, 1))
         return self.stacked(z.view(b, t, *z.shape[1:]))
 
     def frames(self, maps: torch.Tensor) -> torch.Tensor:
         """Features of single frames: [n,C,H,W] -> [n,F,h,w], channels last."""
-        # a (1,8,8) kernel is a 2D convolution of every frame; on a CPU planes are read faster as they are,
-        # but the gradient of their kernel is found faster with channels last
+        # a (1,8,8) kernel is a 2D convolution of every frame; on a CPU the forward pass is faster with
+        # contiguous planes, the gradient of the kernel with channels last
         first = self.per_frame
         inner = torch.channels_last if torch.is_grad_enabled() else torch.contiguous_format
         kernel = first.weight[:, :, 0].contiguous(memory_format=inner)
@@ -70,7 +70,7 @@ class Conv3dMaps(nn.Module):
         return functional.relu_(z).contiguous(memory_format=torch.channels_last)
 
     def stacked(self, frames: torch.Tensor) -> torch.Tensor:
-        """The rest: features of frames [B,T,F,h,w] -> [B,flat]."""
+        """The later layers: features of frames [B,T,F,h,w] -> [B,flat]."""
         # frames in channels last are channels_last_3d in memory: no copy
         z = frames.transpose(1, 2).contiguous(memory_format=torch.channels_last_3d)  # [B,F,T,h,w]
         z = functional.relu_(self.second(z))
@@ -79,9 +79,9 @@ class Conv3dMaps(nn.Module):
 
 
 class EncodedMaps(nn.Module):
-    """The last `frames` frames, each through a frozen encoder that was trained before: maps -> latents.
+    """The last `frames` frames, each through a frozen, pretrained encoder: maps -> latents.
 
-    `maps` may be latents already [B,T,L]: what never changes is not worked out again.
+    `maps` may be latents [B,T,L] from an earlier decision, so frames are encoded once.
     """
 
     def __init__(self, frames: int, config: EncoderConfig) -> None:
@@ -98,14 +98,14 @@ class EncodedMaps(nn.Module):
 
     @property
     def blank(self) -> torch.Tensor:
-        """The latent [L] of a map in which nothing is drawn."""
+        """The latent [L] of an empty map."""
         c = self.encoder.config
-        latent: torch.Tensor = self.encoder(torch.zeros(1, APART, c.height, c.width))[0]
+        latent: torch.Tensor = self.encoder(torch.zeros(1, PLANES, c.height, c.width))[0]
         return latent
 
     def frames(self, maps: torch.Tensor) -> torch.Tensor:
         """Latents of single frames: [n,C,H,W] -> [n,L,1,1]."""
-        latents: torch.Tensor = self.encoder(apart(maps).contiguous(memory_format=torch.channels_last))
+        latents: torch.Tensor = self.encoder(to_planes(maps).contiguous(memory_format=torch.channels_last))
         return latents[..., None, None]
 
     def stacked(self, frames: torch.Tensor) -> torch.Tensor:
@@ -113,33 +113,33 @@ class EncodedMaps(nn.Module):
         return frames[:, -self.count :].flatten(1)
 
 
-AT_ONCE = 256  # frames: all of a city's AVs would take a gigabyte
+FRAMES_PER_BATCH = 256  # limits memory: all AVs of a city at once take a gigabyte
 
 
 class FrameMemory:
-    """Convolves every frame of the AVs' maps once, to the bit as if all were convolved at every decision.
+    """A cache of map features: every frame is convolved once, bit-identical to convolving all each time.
 
-    A past frame's map is drawn in the ego's frame at its own time: it does not change while it ages, and
-    `fresh` frames later it stands that much further to the front of the `past` ones.
+    A past map is drawn in the ego's frame at its own time, so it never changes. `fresh` frames later it
+    has moved `fresh` places to the front of the `past` frames.
     """
 
     def __init__(self, extractor: Conv3dMaps | EncodedMaps, past: int, fresh: int) -> None:
         self._extractor, self._past, self._aged = extractor, past, max(past - fresh, 0)
-        self._row: dict[str, int] = {}  # AV -> its place in:
+        self._row: dict[str, int] = {}  # AV -> its row in:
         self._maps: Bytes = np.empty((0, past, 0), np.uint8)  # [B,T,C,H,W]
         self._features: Floats32 = np.empty((0, past, 0), np.float32)  # [B,T,h,w,F]
 
     def frames(self, names: Sequence[str], maps: torch.Tensor) -> torch.Tensor:
-        """maps [B,T,C,H,W] uint8 of the AVs `names`, the past ones first -> their features [B,T,F,h,w]."""
+        """maps [B,T,C,H,W] uint8 of the AVs `names`, past frames first -> their features [B,T,F,h,w]."""
         old, n = self._aged, self._past
-        pictures = maps.numpy()  # comparing and joining bytes is a tenth of the work in numpy
+        pictures = maps.numpy()  # numpy compares and joins bytes ten times faster
         count, frames = pictures.shape[:2]
-        kept = np.zeros((count, frames), np.bool_)  # seen at the last decision
+        kept = np.zeros((count, frames), np.bool_)  # frames present at the last decision
         for mine, name, known in zip(pictures, names, kept, strict=True):
             row = self._row.get(name)
             known[:old] = row is not None and np.array_equal(self._maps[row, n - old : n], mine[:old])
         new = ~kept
-        many = int(new.sum()) // AT_ONCE + 1  # parts of like size: of a few frames alone bits differ
+        many = int(new.sum()) // FRAMES_PER_BATCH + 1  # equal parts: very small parts change bits
         parts = torch.from_numpy(pictures[new]).tensor_split(many)
         made = to_numpy(torch.cat([self._extractor.frames(part) for part in parts]).permute(0, 2, 3, 1))
         features: Floats32 = np.empty((count, frames, *made.shape[1:]), np.float32)
@@ -152,7 +152,7 @@ class FrameMemory:
 
 
 class Conv2dMaps(nn.Module):
-    """The frames as channels of one picture: the same kernels without time (paper_map.md, Approaches)."""
+    """The frames as channels of one picture: T's kernels without time (paper_map.md, Approaches)."""
 
     def __init__(
         self,

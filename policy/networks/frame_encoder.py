@@ -1,4 +1,4 @@
-"""One map in, a few numbers out: the part of a network that sees, trained on what a map must tell."""
+"""The frame encoder: one map in, a latent vector out, pretrained on quantities visible in a map."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from policy.inputs.tensors import APART
+from policy.inputs.tensors import PLANES
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,14 +16,14 @@ class EncoderConfig:
     height: int = 32
     width: int = 128
     features: tuple[int, int, int] = (24, 32, 32)
-    latent: int = 128  # numbers a frame becomes
+    latent: int = 128  # length of a frame's latent vector
 
 
 class FrameEncoder(nn.Module):
-    """Three 2D convolutions and a layer: maps as `policy.inputs.tensors.apart` reads them -> latents.
+    """Three 2D convolutions and a layer: planes of `policy.inputs.tensors.to_planes` -> latents.
 
-    Along the road it is coarser than across: lanes are 3 m apart, gaps are tens of metres. A frame's map
-    never changes, so its latent can be kept in place of it.
+    The resolution is coarser along the road than across: lanes are 3 m apart, gaps tens of metres. A frame's
+    map never changes, so its latent can be stored in its place.
     """
 
     def __init__(self, config: EncoderConfig) -> None:
@@ -31,7 +31,7 @@ class FrameEncoder(nn.Module):
         self.config = c = config
         first, second, third = c.features
         self.layers = nn.Sequential(
-            nn.Conv2d(APART, first, (4, 8), (2, 4), (1, 2)),
+            nn.Conv2d(PLANES, first, (4, 8), (2, 4), (1, 2)),
             nn.ReLU(inplace=True),
             nn.Conv2d(first, second, 4, 2, 1),
             nn.ReLU(inplace=True),
@@ -48,11 +48,11 @@ class FrameEncoder(nn.Module):
 
 
 class Sight(nn.Module):
-    """The encoder, and what is read from its latents while it is trained.
+    """The encoder with a linear readout for its pretraining.
 
     Args:
         config: layout of the encoder.
-        readings: numbers that are read.
+        readings: number of readout values.
     """
 
     def __init__(self, config: EncoderConfig, readings: int) -> None:

@@ -1,9 +1,9 @@
 """The hybrid predictive network (P, figure 3): the next seconds as maps and as kinematics, from two branches.
 
-Three ways to a map (measured, docs/results/prediction_maps.md):
-- `rendered`: the kinematic branch corrects every vehicle's forecast, and the rasteriser that draws the
-  observed maps draws the predicted ones. Vehicles stay sharp and no step of the chain blurs the next. Ships.
-- `corrected`: P's convolutional map branch sees those maps and predicts a correction, block after block.
+Three variants of the maps (measured in docs/results/prediction_maps.md):
+- `rendered` (shipped): the kinematic branch corrects every vehicle's forecast, and the rasteriser of the
+  observed maps draws the predicted maps. Vehicles stay sharp, and no step of the chain blurs the next.
+- `corrected`: P's convolutional map branch reads those maps and predicts a correction, block after block.
 - `plain`: P's map branch alone, as written. Trained with the mean squared error it predicts empty maps.
 """
 
@@ -18,7 +18,7 @@ from policy.networks.map_branch import MapBranch, MapBranchConfig
 
 @dataclass(frozen=True, slots=True)
 class HpnConfig:
-    """Which branches there are, and their layouts."""
+    """The variant and the layouts of its branches."""
 
     maps: Literal["rendered", "corrected", "plain"] = "rendered"
     kinematic: KinematicConfig = field(default_factory=KinematicConfig)  # not in `plain`
@@ -26,15 +26,15 @@ class HpnConfig:
 
 
 class HPN(nn.Module):
-    """The branches that the configuration asks for; `policy.chain.chain.predict` runs them (P, fig. 3).
+    """The branches of the configured variant; `policy.chain.chain.predict` runs them (P, fig. 3).
 
     Untrained, `rendered` and `corrected` return the maps rendered from the forecast along the lanes.
 
     Args:
-        config: which branches there are, and their layouts.
+        config: the variant and the layouts of its branches.
 
     Raises:
-        ValueError: the map branch is not of the kind that `maps` needs.
+        ValueError: `map_branch.correct` contradicts `maps`.
     """
 
     kinematic: KinematicBranch | None

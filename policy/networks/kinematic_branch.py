@@ -1,10 +1,10 @@
-"""The HPN's kinematic branch: corrects every vehicle's forecast, and says how sure it is of each place.
+"""The HPN's kinematic branch: a correction of every vehicle's forecast, with a confidence per position.
 
-P's branch K is two fully connected layers of 128 whose output the Gaussian process corrects (P, figure 3,
-eq. 10). Here it works the other way round, and for one vehicle at a time: the forecasts (Gaussian process,
-and the same speeds along the lane) come in, a small correction goes out: how much of each forecast to
-believe, how far ahead or aside of it the vehicle will really be. The weights are shared by all vehicles,
-which see one another through pooled features of the nearest. Untrained it corrects nothing.
+P's branch K is two fully connected layers of 128 units; the Gaussian process corrects their output (P, figure
+3, eq. 10). Here the branch corrects the Gaussian process, one vehicle at a time. Inputs are two forecasts:
+the Gaussian process's, and the same speeds along the lane. Outputs are the weight of each forecast and the
+offset ahead and aside. All vehicles share the weights; neighbours enter through pooled features of the
+nearest. An untrained branch corrects nothing.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from cosim.types import Floats, Floats32, Ints
 from policy.prediction.forecast import KinematicForecast
 from policy.prediction.vehicle_inputs import NEIGHBOUR_INPUTS, VehicleInputs, own_inputs
 
-OUTPUTS = 7  # belief in the GP; ahead, left, speed, heading; sureness as the one seen, as the one who looks
+OUTPUTS = 7  # weight of the GP; ahead, left, speed, heading; confidence as seen vehicle, as observing AV
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,28 +59,28 @@ class KinematicBranch(nn.Module):
         self.out = nn.Linear(c.hidden, c.horizon * OUTPUTS)
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
-        t = torch.linspace(0.0, 1.0, c.horizon + 1)[1:]  # of the horizon
+        t = torch.linspace(0.0, 1.0, c.horizon + 1)[1:]  # share of the horizon
         one = torch.ones_like(t)
-        # how large an error is at each frame, so that every output is of order one
+        # scale of the error at each frame, so that every output is of order one
         scale = [2 * one, 4 * t**2 + 0.005, t**1.5 + 0.002, 4 * t + 0.02, 0.3 * t**1.5 + 0.001, one, one]
         self.register_buffer("unit", torch.stack(scale, -1), persistent=False)
 
     def features(self, own: torch.Tensor, near: torch.Tensor) -> torch.Tensor:
         """The last hidden layer [V,hidden]; arguments as in `forward`."""
-        n = self.near(near) * near[..., :1]  # the first input says whether anybody is there
+        n = self.near(near) * near[..., :1]  # the first input is 1 for an existing neighbour
         joined: torch.Tensor = self.joined(torch.cat([self.own(own), n.amax(-2), n.mean(-2)], -1))
         return joined
 
     def forward(self, own: torch.Tensor, near: torch.Tensor) -> torch.Tensor:
-        """What to correct of every vehicle's forecast (P, figure 3 and eq. 10).
+        """The correction of every vehicle's forecast (P, figure 3 and eq. 10).
 
         Args:
             own: [V,own_inputs(N)] scaled (`policy.prediction.vehicle_inputs.VehicleInputs`).
             near: [V,NEIGHBOURS,NEIGHBOUR_INPUTS] scaled.
 
         Returns:
-            [V,M,OUTPUTS] belief in the Gaussian process (logit); ahead m, left m, speed m/s, heading rad; two
-            logits of `sureness`.
+            [V,M,OUTPUTS] weight of the Gaussian process (logit); ahead m, left m, speed m/s, heading rad;
+            two logits of `confidence`.
         """
         raw: torch.Tensor = self.out(self.features(own, near)).contiguous()
         return raw.view(*raw.shape[:-1], self.config.horizon, OUTPUTS) * self.unit
@@ -89,7 +89,7 @@ class KinematicBranch(nn.Module):
 def correct(raw: torch.Tensor, lane: torch.Tensor, gp: torch.Tensor) -> torch.Tensor:
     """Corrected states [...,M,4] x y speed heading from raw [...,M,OUTPUTS] and the two forecasts [...,M,4].
 
-    Untrained the lane's forecast is believed seven times as much as the Gaussian process's.
+    Untrained, the forecast along the lane has seven times the weight of the Gaussian process's.
     """
     base = lane + torch.sigmoid(raw[..., :1] - 2.0) * (gp - lane)
     c, s = torch.cos(base[..., 3]), torch.sin(base[..., 3])
@@ -104,34 +104,34 @@ def correct(raw: torch.Tensor, lane: torch.Tensor, gp: torch.Tensor) -> torch.Te
     )
 
 
-def sureness(seen: torch.Tensor, looking: torch.Tensor) -> torch.Tensor:
-    """Expected share of a vehicle's drawn box that is really its own, in the picture of one who looks.
+def confidence(seen: torch.Tensor, looking: torch.Tensor) -> torch.Tensor:
+    """Expected overlap of a vehicle's drawn box with its true box, in the picture of an observing AV.
 
-    Logits of the vehicle seen and of the AV that looks (its own pose errs as well) -> [0,1].
+    Logits of the seen vehicle and of the observing AV (its own pose has an error too) -> [0,1].
     """
     return torch.sigmoid(seen + looking + 4.0)
 
 
 class Corrected(NamedTuple):
-    """What the branch makes of a scene's forecast."""
+    """A scene's corrected forecast."""
 
     forecast: KinematicForecast
-    seen: Floats32  # [V,M] logits of `sureness`
+    seen: Floats32  # [V,M] logits of `confidence`
     looking: Floats32  # [V,M]
 
-    def share(self, who: Ints) -> Floats:
-        """[B,k,M] `sureness` of the vehicles who [B,k] in the picture of each AV, the AV itself first."""
-        logit = self.seen[who] + self.looking[who[:, 0]][:, None] + 4.0
+    def share(self, index: Ints) -> Floats:
+        """[B,k,M] `confidence` of the vehicles `index` [B,k] in each AV's picture, the AV itself first."""
+        logit = self.seen[index] + self.looking[index[:, 0]][:, None] + 4.0
         out: Floats = 1.0 / (1.0 + np.exp(-logit.astype(np.float64)))
-        out[:, 0] = 1.0  # every AV is in the middle of its own picture
+        out[:, 0] = 1.0  # an AV is at the centre of its own picture by definition
         return out
 
 
 def apply(branch: KinematicBranch, inputs: VehicleInputs, forecast: KinematicForecast) -> Corrected:
-    """Correct a scene's forecast (at least `horizon` frames; the frames beyond it are cut)."""
+    """Correct a scene's forecast (at least `horizon` frames; later frames are cut)."""
     m = branch.config.horizon
     lane, gp = inputs.lane[:, :m], inputs.gp[:, :m]
-    origin = lane[:, :1] * (1.0, 1.0, 0.0, 0.0)  # world coordinates need more digits than float32 has
+    origin = lane[:, :1] * (1.0, 1.0, 0.0, 0.0)  # world coordinates exceed the precision of float32
     device = branch.unit.device
     with torch.autocast(device.type, enabled=False):
         raw = branch(torch.from_numpy(inputs.own).to(device), torch.from_numpy(inputs.near).to(device))

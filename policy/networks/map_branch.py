@@ -25,30 +25,30 @@ class MapBranchConfig:
     block: int = 5  # frames predicted per step; 1 is the paper's (observation.md, Clocks)
     reading: Literal["s2fc", "pool"] = "pool"  # stride 2 then FC, or stride 2 with pooling
     history: bool = True  # False: the current frame only (P, figure 6)
-    correct: bool = False  # True: see the rendered next map and predict its correction
-    skips: bool = False  # add encoder features to the decoder's: P has none
+    correct: bool = False  # True: read the rendered next map and predict its correction
+    skips: bool = False  # skip connections from encoder to decoder: P has none
     features: tuple[int, int, int] = (32, 64, 64)  # P, section IV-C.1
     hidden: int = 128  # P: FC layers of the K branch
     latent: int = 512  # P, Table I
 
     @property
     def seen(self) -> int:
-        """Past frames that enter the network."""
+        """Number of past frames in the input."""
         return self.frames if self.history else 1
 
 
 class MapBranch(nn.Module):
     """Predictive autoencoder with a map branch and a kinematic branch, added elementwise.
 
-    With `correct`, the last map layer starts at zero: the untrained network returns the rendered map, and
-    training can only be kept where it beats it.
+    With `correct`, the last map layer starts at zero: the untrained network returns the rendered map, the
+    baseline that training has to beat.
     """
 
     def __init__(self, config: MapBranchConfig) -> None:
         super().__init__()
         self.config = c = config
         size = (c.height, c.width)
-        self._stages: list[tuple[Size, Size, Size]] = []  # size a convolution sees, size it yields, pooling
+        self._stages: list[tuple[Size, Size, Size]] = []  # input size, output size, pooling of each layer
         widths = [(c.seen + (c.block if c.correct else 0)) * c.channels, *c.features]
         self.encoder = nn.ModuleList()
         for k in range(3):
@@ -62,7 +62,7 @@ class MapBranch(nn.Module):
         self.kinematics_in = nn.Sequential(
             nn.Linear(c.seen * c.rows * KINEMATIC_INPUTS, c.hidden), nn.ReLU(), nn.Linear(c.hidden, flat)
         )
-        direct = c.reading == "pool" and flat == c.latent  # the paper's numbers then fit without a layer
+        direct = c.reading == "pool" and flat == c.latent  # the paper's sizes then need no extra layer
         self.to_latent = nn.Identity() if direct else nn.Linear(flat, c.latent)
         self.from_latent = nn.Identity() if direct else nn.Linear(c.latent, flat)
         self.decoder = nn.ModuleList()
@@ -77,7 +77,7 @@ class MapBranch(nn.Module):
                 nn.init.zeros_(parameter)
 
     def encode(self, z: torch.Tensor) -> tuple[torch.Tensor, list[torch.Tensor]]:
-        """Frames [B,k*C,H,W] through the encoder: its output, and what every layer gave before pooling."""
+        """Frames [B,k*C,H,W] through the encoder: its output, and every layer's output before pooling."""
         layers: list[torch.Tensor] = []
         for convolution, (_, _, pool) in zip(self.encoder, self._stages, strict=True):
             z = functional.relu_(convolution(z))
@@ -101,7 +101,7 @@ class MapBranch(nn.Module):
             (scaled as the input is).
 
         Raises:
-            ValueError: a rendered map is missing, or there is one that is not corrected.
+            ValueError: a rendered map is missing, or is given without `correct`.
         """
         c = self.config
         if c.correct != (rendered is not None):

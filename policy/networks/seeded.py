@@ -11,12 +11,12 @@ Made = TypeVar("Made")
 
 
 def seeded(build: Callable[[], Made], seed: int) -> Made:
-    """What `build` makes, weights drawn from `seed`; torch's generator is left as it was."""
+    """The result of `build` with weights drawn from `seed`; torch's global generator is restored."""
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)  # module initialisers know no generator
+        torch.manual_seed(seed)  # module initialisers take no generator
         return build()
 
 
 def first_weights(build: Callable[[], Made], seed: int) -> Made:
-    """`seeded` for the network of a training whose seed of everything is `seed`."""
+    """`seeded` for the network of a training run with the overall seed `seed`."""
     return seeded(build, subseed(seed, "network") % 2**31)

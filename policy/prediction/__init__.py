@@ -1,1 +1,1 @@
-"""Where everybody will be: kinematic predictors, and traffic along the lanes."""
+"""Prediction of all vehicles: kinematic predictors, and traffic along the lanes."""

@@ -53,7 +53,7 @@ class ConstantAcceleration(ConstantSpeed):
 
 
 def newest(kinematics: Floats, valid: Bools) -> tuple[Floats, Bools]:
-    """The newest state [V,4] (zeros where unknown) and who is known [V]."""
+    """The newest state [V,4] (zeros where unknown) and its validity [V]."""
     now = np.asarray(kinematics[:, -1, :4], dtype=np.float64)
     known = valid[:, -1] & np.isfinite(now).all(1)
     return np.where(known[:, None], np.nan_to_num(now), 0.0), known

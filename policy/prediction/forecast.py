@@ -17,7 +17,7 @@ class KinematicForecast(NamedTuple):
     y: Floats  # [V,M] m
     speed: Floats  # [V,M] m/s, never negative
     heading: Floats  # [V,M] rad, unwrapped
-    speed_std: Floats  # [V,M] m/s, zero for predictors that do not know their error
+    speed_std: Floats  # [V,M] m/s, zero for predictors without an error estimate
     heading_std: Floats  # [V,M] rad
     along_std: Floats  # [V,M] m, of the position in the predicted driving direction
     across_std: Floats  # [V,M] m
@@ -27,7 +27,7 @@ class KinematicForecast(NamedTuple):
     def without_spread(
         cls, x: Floats, y: Floats, speed: Floats, heading: Floats, valid: Bools
     ) -> KinematicForecast:
-        """States [V,M] of a predictor that does not know its error; valid [V]."""
+        """States [V,M] of a predictor without an error estimate; valid [V]."""
         zero = np.zeros_like(x)
         return cls(x, y, speed, heading, zero, zero, zero, zero, valid)
 

@@ -2,8 +2,8 @@
 
 P, equations (1), (7), (8): a series is f ~ GP(m, k) with k = linear + RBF + white noise and time centred on
 the newest frame. All series share one time grid, so for a finite bank of kernels (P's reference [14])
-prediction is a matrix product with operators computed once. Per series the kernels are averaged by marginal
-likelihood times a prior over kernels; picking the best one is worse (measured, prediction.md).
+prediction is a matrix product with precomputed operators. Per series the kernels are averaged by marginal
+likelihood times a prior over kernels; the most likely kernel alone is worse (measured, prediction.md).
 """
 
 import itertools
@@ -16,20 +16,20 @@ import numpy as np
 from cosim.geometry.compiled import compiled
 from cosim.types import Floats
 
-NEGLIGIBLE = 1e-5  # weight of a kernel that is left out: a hundred of them move a speed by mm/s
+MIN_KERNEL_WEIGHT = 1e-5  # kernels of lower weight are skipped: a hundred of them change a speed by mm/s
 
 
 @dataclass(frozen=True, slots=True)
 class BankConfig:
     """The kernels: every combination below, in units of `unit` and seconds."""
 
-    unit: float  # the scale at which ordinary series vary within 2 s, e.g. 1 m/s
+    unit: float  # typical variation of a series within 2 s, e.g. 1 m/s
     slope: tuple[float, ...]  # per s: standard deviation of the linear kernel's slope
     amplitude: tuple[float, ...]  # of the RBF part
     length: tuple[float, ...]  # s, RBF length scales
-    noise: tuple[float, ...]  # white: simulated state is exact, how well a kernel fits it is not
+    noise: tuple[float, ...]  # white: simulated state is exact, a kernel's fit is not
     drift: tuple[float, ...] = (0.0,)  # per s: mean function m(t) = level + drift t of eq. (1c)
-    bias: float = 10.0  # the constant part of the linear kernel, wide: no pull towards a level
+    bias: float = 10.0  # constant part of the linear kernel; wide: no pull towards a level
 
     def kernels(self) -> Floats:
         """[K,5] slope, amplitude, length, noise, drift."""
@@ -38,17 +38,17 @@ class BankConfig:
         )
 
 
-# m/s. Slopes and drifts as m/s2: cruising, ordinary and hard braking; who brakes is not who accelerates.
+# m/s. Slopes and drifts in m/s2: cruising, ordinary and hard braking, acceleration.
 SPEED = BankConfig(1.0, (0.2, 1.0), (0.5, 2.0), (1.0, 2.5), (0.02, 0.2), (-2.5, 0.0, 1.5))
 # 0.05 rad: 1 m/s sideways at 20 m/s, a usual lane change. Drifts of 0.15 and 0.4 rad/s: round rings, corners.
 HEADING = BankConfig(0.05, (0.2,), (0.5, 3.0), (0.7, 2.0), (0.02, 0.2), (-8.0, -3.0, 0.0, 3.0, 8.0))
-# m, of "direct" positions: ahead of and aside of where constant speed leads.
+# m, of "direct" positions: ahead and aside of the constant-speed position.
 ALONG = BankConfig(1.0, (0.2, 2.0), (0.5, 2.0, 8.0), (1.0, 2.5, 5.0), (0.02, 0.2))
 ACROSS = BankConfig(0.5, (0.2, 2.0), (0.5, 2.0, 8.0), (1.0, 2.5, 5.0), (0.02, 0.2))
 
 
 class SeriesForecast(NamedTuple):
-    """Moments of the mixture over kernels, and of the integral from now on (for positions)."""
+    """Moments of the mixture over kernels, and of its integral from now on (for positions)."""
 
     mean: Floats  # [S,M]
     variance: Floats  # [S,M]
@@ -57,15 +57,15 @@ class SeriesForecast(NamedTuple):
 
 
 class Operators(NamedTuple):
-    """Everything that does not depend on the data, for histories of n frames; in the config's units.
+    """The data-independent operators for histories of n frames, in the config's units.
 
-    Along 2M: the series at each step ahead, then its integral up to each step.
+    Axis 2M: the series at each step ahead, then its integral up to each step.
     """
 
     predict: Floats  # [n,K*M] past relative to the newest value -> the series ahead
-    drift: Floats  # [K*M] what the mean function adds
+    drift: Floats  # [K*M] contribution of the mean function
     whiten: Floats  # [n,K*n] past -> L^-1 (y - m)
-    drift_white: Floats  # [K*n] what the mean function takes off
+    drift_white: Floats  # [K*n] the mean function's share of the past
     log_norm: Floats  # [K] the data-free part of the log marginal likelihood
     variance: Floats  # [K,2M]
 
@@ -85,7 +85,7 @@ class GaussianProcessBank:
         Args:
             values: [S,n] oldest first.
             log_prior: [K] or [S,K] log weight of each kernel, uniform when None.
-            temperature: divides the log marginal likelihood, too sure where no kernel is right.
+            temperature: divides the log marginal likelihood, which is overconfident under a wrong kernel.
 
         Returns:
             moments [S,M] in the series' own unit, and of the integral, unit * s.
@@ -95,7 +95,7 @@ class GaussianProcessBank:
         level = np.ascontiguousarray(values[:, -1:])
         past = (values - level) / self.config.unit
         logit = np.zeros((s, k)) if log_prior is None else np.broadcast_to(log_prior, (s, k))
-        if values.shape[1] > 1:  # one value says nothing about the kernel: the prior alone
+        if values.shape[1] > 1:  # a single value holds no evidence about the kernel
             logit = logit + self.evidence(past) / temperature
         weight = np.exp(logit - logit.max(1, keepdims=True))
         weight /= weight.sum(1, keepdims=True)  # [S,K]
@@ -149,7 +149,7 @@ def covariance(kernel: Floats, a: Floats, b: Floats, bias: float) -> Floats:
 
 
 def trapezoid(steps: int, dt: float) -> Floats:
-    """[M,M] the integral of a series up to each of its steps, from a 0 one step before the first."""
+    """[M,M] integral of a series up to each step, starting from 0 one step before the first."""
     return np.asarray(dt * (np.tri(steps) - 0.5 * np.eye(steps)))
 
 
@@ -169,7 +169,7 @@ def _operators(config: BankConfig, m: int, dt: float, count: int) -> Operators:
         parts.append(
             (
                 operator,
-                kernel[4] * (ahead - past @ operator),  # m(ahead) less what m(past) would predict
+                kernel[4] * (ahead - past @ operator),  # m(ahead) minus the prediction from m(past)
                 inverse.T,
                 inverse @ (kernel[4] * past),
                 -np.log(np.diag(lower)).sum() - 0.5 * count * np.log(2 * np.pi),
@@ -190,7 +190,7 @@ def _operators(config: BankConfig, m: int, dt: float, count: int) -> Operators:
 @compiled
 def _mix(
     weight: Floats,  # [S,K]
-    each: Floats,  # [S,K,M] what every kernel predicts, relative to now
+    each: Floats,  # [S,K,M] prediction of every kernel, relative to now
     variance: Floats,  # [K,2M]
     dt: float,
     mean: Floats,  # [S,2M] out
@@ -203,7 +203,7 @@ def _mix(
         second[s] = 0.0
         for k in range(weight.shape[1]):
             w = weight[s, k]
-            if w < NEGLIGIBLE:
+            if w < MIN_KERNEL_WEIGHT:
                 continue
             before = area = 0.0
             for i in range(steps):

@@ -13,9 +13,9 @@ from policy.prediction.past import trailing_run, whole_past
 
 
 class _GaussianProcess:
-    """What both share: banks, their learned prior, whole histories.
+    """Common base: banks, their learned prior, completed histories.
 
-    `weights`: the fitted prior and calibration, as it is or from a file; None: the shipped one.
+    `weights`: the fitted prior and calibration, as an object or a file; None: the shipped one.
     """
 
     name: str
@@ -47,8 +47,8 @@ class _GaussianProcess:
     def predict(self, kinematics: Floats, valid: Bools) -> KinematicForecast:
         """See `Predictor.predict`; P, eq. 7 to 9.
 
-        Only the unbroken run of valid, finite frames up to now counts, and what lies before it is completed
-        (`policy.prediction.past`); a vehicle that is not valid now gets no forecast (`valid` False, zeros).
+        Only the unbroken run of valid, finite frames up to now counts; earlier frames are completed
+        (`policy.prediction.past`). A vehicle that is not valid now gets no forecast (`valid` False, zeros).
         """
         state = np.asarray(kinematics[:, :, :4], dtype=np.float64)
         run = trailing_run(state, valid)
@@ -68,7 +68,7 @@ class _GaussianProcess:
         raise NotImplementedError
 
     def _forecast(self, now: Floats, moments: Floats, scale: Floats, known: Bools) -> KinematicForecast:
-        """Put together; moments [2,4,V,M] mean, variance, integral, its variance; scale [spreads,V,M]."""
+        """The forecast; moments [2,4,V,M] mean, variance, integral, its variance; scale [spreads,V,M]."""
         raise NotImplementedError
 
 
@@ -84,7 +84,7 @@ class GaussianProcessIndirect(_GaussianProcess):
 
     def _forecast(self, now: Floats, moments: Floats, scale: Floats, known: Bools) -> KinematicForecast:
         (v, v_var, _, along_var), (h, h_var, _, turned_var) = moments
-        v = np.maximum(v, 0.0)  # nobody reverses
+        v = np.maximum(v, 0.0)  # vehicles do not reverse
         x, y = integrate_position(now, v, h, self.dt)
         # eq. (9) linearised: along by the integral of speed, across by the turned angle at mean speed
         elapsed = self.dt * np.arange(1, self.horizon + 1)
@@ -95,9 +95,9 @@ class GaussianProcessIndirect(_GaussianProcess):
 
 
 class GaussianProcessDirect(_GaussianProcess):
-    """Positions themselves by the kernel bank, in the vehicle's own frame; speed and heading follow.
+    """Positions by the kernel bank, in the vehicle's own frame; speed and heading follow.
 
-    The mean function is straight on at the present speed: one frame alone then gives constant speed.
+    The mean function is straight motion at the present speed: a single frame gives constant speed.
     """
 
     name = "gp-direct"

@@ -1,8 +1,8 @@
-"""The learned prior over a bank's kernels: which are likely for a vehicle that moves as this one does now.
+"""The learned prior over a bank's kernels, given a vehicle's present motion.
 
-A network of one small hidden layer from a few figures of the present motion to a log weight per kernel, the
-temperature of the marginal likelihood, and how far the forecast can be trusted (a factor on each standard
-deviation). Fitted on recorded training episodes (`policy.training.predictors`), shipped in `policy/weights`.
+A network with one small hidden layer maps features of the present motion to a log weight per kernel and a
+factor on each standard deviation; the temperature of the marginal likelihood is learned too. Fitted on
+recorded training episodes (`policy.training.predictors`), shipped in `policy/weights`.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from cosim.types import Bools, Floats
 
 LAGS = np.array([1, 2, 4, 9])  # frames back over which speed and heading are compared with now
 FEATURES = 4 + 2 * len(LAGS) + 3
-STANDING = 0.1  # m/s, SUMO's own threshold of a halt
+STANDSTILL_SPEED = 0.1  # m/s, SUMO's own threshold of a halt
 
 
 @dataclass(frozen=True, slots=True)
 class PriorConfig:
-    """Layout of one prior; a checkpoint made for another one is refused."""
+    """Layout of one prior; a checkpoint of another layout is refused."""
 
     kernels: tuple[int, ...]  # of each bank
-    spreads: int  # quantities whose standard deviation is scaled
+    spreads: int  # number of scaled standard deviations
     horizon: int = 20
-    frames: int = 10  # N, a whole past
+    frames: int = 10  # N, a complete history
     dt: float = 0.2  # s
     features: int = FEATURES
     hidden: int = 64
 
 
 class PriorNetwork(nn.Module):
-    """As it is trained and stored. Starts as the uniform prior."""
+    """The prior as a torch module, for training and storage. Starts as the uniform prior."""
 
     calibration: torch.Tensor
 
@@ -48,8 +48,8 @@ class PriorNetwork(nn.Module):
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
         self.log_temperature = nn.Parameter(torch.full((len(config.kernels),), 2.5))
-        # factors that make a 90 % interval cover 90 % at each step, found on episodes not trained on; a row
-        # for each number of frames that are known, 1 to N: a completed past is less sure
+        # factors that make a 90 % interval cover 90 % at each step, from held-out episodes; a row for each
+        # number of known frames, 1 to N: a completed past is less certain
         self.register_buffer("calibration", torch.ones(config.frames, config.spreads, config.horizon))
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
@@ -58,11 +58,11 @@ class PriorNetwork(nn.Module):
 
 
 class KernelPrior(NamedTuple):
-    """The same in numpy, for prediction."""
+    """The prior in numpy, for prediction."""
 
     hidden: tuple[Floats, Floats]  # [F,H], [H]
     out: tuple[Floats, Floats]  # [H,K], [K]
-    cuts: tuple[int, ...]  # where one bank's weights end
+    cuts: tuple[int, ...]  # end of each bank's weights
     temperature: Floats  # [banks]
     calibration: Floats  # [N,spreads,M]
     dt: float  # s between the calibration's steps
@@ -86,7 +86,7 @@ class KernelPrior(NamedTuple):
         return parts[:-1], np.exp(parts[-1])
 
     def calibrated(self, horizon: int, dt: float) -> Floats:
-        """[N,spreads,M] factors at the steps asked for; beyond the last one calibrated, that one's."""
+        """[N,spreads,M] factors at the requested steps; beyond the last calibrated step, the last factor."""
         found = self.calibration
         known = self.dt * np.arange(1, found.shape[2] + 1)
         wanted = dt * np.arange(1, horizon + 1)
@@ -114,7 +114,7 @@ def describe(past: Floats, known: Bools, dt: float) -> Floats:
         speed, heading = past[v, now, 2], past[v, now, 3]
         out[v, 0] = speed / 15.0 - 1.0
         out[v, 1] = out[v, 0] ** 2
-        out[v, 2] = speed < STANDING
+        out[v, 2] = speed < STANDSTILL_SPEED
         out[v, 3] = np.exp(-speed / 2.0)
         at = 4
         for frames in LAGS:

@@ -1,6 +1,6 @@
-"""`gp-lane`: the Gaussian process's speed carried along the vehicle's lane, as the safety mask predicts.
+"""`gp-lane`: the Gaussian process's speed carried along the vehicle's lane, as in the safety mask.
 
-Not one of P's eight: it knows the road and where on it a vehicle is, which they do not.
+Not one of P's eight predictors: those do not know the road or the vehicle's position on it.
 """
 
 import numpy as np
@@ -24,8 +24,8 @@ def along_lanes(
 ) -> KinematicForecast:
     """`forecast` [V,M] of the vehicles state [V,N,4], valid [V,N] of one moment, led along their lanes.
 
-    lane [V] index into `road.lanes`, -1 for none (who keeps the forecast as it is); lane_position [V] m of
-    the front bumper; length [V] m. The standard deviations stay as they are.
+    lane [V] index into `road.lanes`, -1 for none (the forecast is unchanged); lane_position [V] m of the
+    front bumper; length [V] m. The standard deviations are unchanged.
     """
     count, frames = forecast.x.shape
     now = np.where(np.isfinite(state), state, 0.0)

@@ -16,12 +16,12 @@ from policy.prediction.past import trailing_run, whole_past
 
 INPUTS = 6  # per frame, see `features`
 # Scales that bring inputs and outputs to order one: m behind, m aside, m/s, rad, m/s of change.
-BEHIND, ASIDE, SPEED, TURN, GAIN = 30.0, 5.0, 15.0, 0.3, 2.0
+BEHIND_SCALE, ASIDE_SCALE, SPEED_SCALE, HEADING_SCALE, SPEED_GAIN_SCALE = 30.0, 5.0, 15.0, 0.3, 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class NetConfig:
-    """Layout of one network; small, as P's baselines are."""
+    """Layout of one network; small, like P's baselines."""
 
     kind: Literal["lstm", "ae"]
     target: Literal["direct", "indirect"]
@@ -29,7 +29,7 @@ class NetConfig:
     horizon: int = 20  # M
     dt: float = 0.2  # s
     hidden: int = 64
-    latent: int = 16  # of the autoencoder
+    latent: int = 16  # size, of the autoencoder
 
 
 class KinematicNet(nn.Module):
@@ -74,9 +74,9 @@ class KinematicNet(nn.Module):
         raw = self.head(past).view(-1, 2, c.horizon)
         elapsed = c.dt * torch.arange(1, c.horizon + 1, dtype=raw.dtype)
         if c.target == "direct":
-            return speed[:, None] * elapsed + ASIDE * raw[:, 0], GAIN * raw[:, 1]
-        v = (speed[:, None] + GAIN * raw[:, 0]).clamp(min=0.0)
-        h = TURN * raw[:, 1]
+            return speed[:, None] * elapsed + ASIDE_SCALE * raw[:, 0], SPEED_GAIN_SCALE * raw[:, 1]
+        v = (speed[:, None] + SPEED_GAIN_SCALE * raw[:, 0]).clamp(min=0.0)
+        h = HEADING_SCALE * raw[:, 1]
         return *integrate(speed, v, h, c.dt), v, h
 
 
@@ -99,20 +99,20 @@ def features(past: Floats, known: Bools) -> torch.Tensor:
     dx, dy = past[:, :, 0] - now[:, :, 0], past[:, :, 1] - now[:, :, 1]
     c, s = np.cos(now[:, :, 3]), np.sin(now[:, :, 3])
     columns = (
-        (c * dx + s * dy) / BEHIND,
-        (c * dy - s * dx) / ASIDE,
-        past[:, :, 2] / SPEED,
-        (past[:, :, 3] - now[:, :, 3]) / TURN,
-        (past[:, :, 2] - now[:, :, 2]) / GAIN,
+        (c * dx + s * dy) / BEHIND_SCALE,
+        (c * dy - s * dx) / ASIDE_SCALE,
+        past[:, :, 2] / SPEED_SCALE,
+        (past[:, :, 3] - now[:, :, 3]) / HEADING_SCALE,
+        (past[:, :, 2] - now[:, :, 2]) / SPEED_GAIN_SCALE,
         np.ones_like(dx),
     )
     return torch.from_numpy(np.where(known[:, None, None], np.stack(columns, -1), 0.0).astype(np.float32))
 
 
 class Learned:
-    """One of the four on the predictors' protocol. `weights`: None for the shipped ones.
+    """One of the four networks as a `Predictor`. `weights`: None for the shipped ones.
 
-    Raises BadInput for a horizon or dt it was not made for, WeightsMismatch for weights of another layout.
+    Raises BadInput for another horizon or dt than in training, WeightsMismatch for weights of another layout.
     """
 
     def __init__(

@@ -1,9 +1,9 @@
-"""Rolls vehicles out along real centre lines: where a predicted speed takes them (numba kernels).
+"""Rollouts of vehicles along real centre lines at predicted speeds (numba kernels).
 
-A vehicle's front follows one path (a polyline) at a given speed profile; its sideways offset from that path
-closes at a given rate (a lane change, or what is left of one), and its rear trails behind, as in SUMO: the
-front changes lanes in 2 s at any speed, the box straightens only over the distance driven (measured with
-1.28: after a change at 1 m/s a car stands 29 degrees askew, at 15 m/s never more than 6).
+A vehicle's front follows one path (a polyline) at a given speed profile. Its lateral offset from that path
+closes at a given rate (a lane change, or the rest of one), and its rear trails behind, as in SUMO: the front
+changes lanes in 2 s at any speed, the box straightens only over the distance driven. Measured with SUMO 1.28:
+after a lane change at 1 m/s a car is 29 degrees askew, at 15 m/s never more than 6.
 """
 
 from collections.abc import Sequence
@@ -17,11 +17,11 @@ from cosim.types import HEADING, LENGTH, Floats, Ints, X, Y
 
 
 class Paths(NamedTuple):
-    """Polylines packed one behind the other for the kernels."""
+    """Concatenated polylines for the kernels."""
 
     points: Floats  # [p,2] m
     arc: Floats  # [p] m
-    start: Ints  # [k+1] where each path begins
+    start: Ints  # [k+1] first point of each path
 
 
 class Rollout(NamedTuple):
@@ -32,7 +32,7 @@ class Rollout(NamedTuple):
     heading: Floats  # [k,T+1] rad
     speed: Floats  # [k,T+1] m/s
     arc: Floats  # [k,T+1] m, front bumper along the path
-    rear: Floats  # [k,T+1] m, how far the rear stands beside the path, left positive
+    rear: Floats  # [k,T+1] m, lateral offset of the rear from the path, left positive
 
 
 def pack(paths: Sequence[LanePath]) -> Paths:
@@ -48,13 +48,13 @@ def pack(paths: Sequence[LanePath]) -> Paths:
 def project(
     points: Floats, arc: Floats, first: int, last: int, x: float, y: float, around: float
 ) -> tuple[float, float]:
-    """The nearest place on a polyline, which goes on straight beyond its ends.
+    """The nearest point on a polyline, which continues straight beyond its ends.
 
     Args:
         points: [p,2] m; arc: [p] m.
         first, last: the polyline is points[first:last].
         x, y: m, the point.
-        around: m, arc length within 60 m of which is looked; nan: anywhere.
+        around: m, arc length; the search covers 60 m around it; nan: the whole polyline.
 
     Returns:
         arc length m, offset m (left positive).
@@ -90,7 +90,7 @@ def project_many(
     Args:
         points, arc, start: k packed paths (`Paths`).
         x, y: [k] m, the point of each path.
-        around: [k] m, arc length near which is looked; nan: anywhere.
+        around: [k] m, arc length of the search, as in `project`.
 
     Returns:
         arc [k] m, offset [k] m (left positive).
@@ -110,7 +110,7 @@ def project_each(
 
     Args:
         points, arc, start: packed paths (`Paths`).
-        same: [k] the first path that is the same, whose answer is copied.
+        same: [k] index of the first identical path, whose result is copied.
         x, y: [n] m.
 
     Returns:
@@ -129,7 +129,7 @@ def project_each(
 
 @compiled
 def _at(points: Floats, arc: Floats, first: int, last: int, i: int, s: float) -> tuple[int, float, float]:
-    """Segment, x, y at arc length s, looking from segment i on (either way); straight beyond the ends."""
+    """Segment, x, y at arc length s, searched from segment i in both directions; straight beyond the ends."""
     while i < last - 2 and arc[i + 1] < s:
         i += 1
     while i > first and arc[i] > s:
@@ -160,15 +160,15 @@ def roll(
 
     Args:
         points, arc, start: k packed paths (`Paths`).
-        begin: [k] m, arc of the front now.
-        offset: [k] m, front beside the path now, left positive.
-        aim: [k] m, offset at which it ends up.
-        heading: [k] rad, now.
-        rate: [k] m/s >= 0, at which it gets there.
+        begin: [k] m, present arc of the front.
+        offset: [k] m, present lateral offset of the front from the path, left positive.
+        aim: [k] m, final offset.
+        heading: [k] rad, present.
+        rate: [k] m/s >= 0, lateral speed towards `aim`.
         length: [k] m.
         speed: [k,T+1] m/s.
-        stop: [k] m, arc at which the front has to stand; inf for none.
-        brake: m/s2 with which it gets there.
+        stop: [k] m, arc at which the front must stop; inf for none.
+        brake: m/s2, deceleration before `stop`.
         dt: s between frames.
 
     Returns:
@@ -181,7 +181,7 @@ def roll(
         s, front, rear = begin[k], start[k], start[k]
         v = speed[k, 0]
         side = 1.0 if offset[k] > aim[k] else -1.0
-        left = abs(offset[k] - aim[k])  # still to go
+        left = abs(offset[k] - aim[k])  # m, remaining
         turn = 0.0
         for t in range(frames):
             if t > 0:
@@ -203,7 +203,7 @@ def roll(
                 turn = min(max(turn, -0.8), 0.8)
             front, fx, fy = _at(points, arc, first, last, front, s)
             rear, rx, ry = _at(points, arc, first, last, rear, s - length[k])
-            along = np.arctan2(fy - ry, fx - rx)  # SUMO's own angle on a bend: from rear to front
+            along = np.arctan2(fy - ry, fx - rx)  # SUMO's angle on a bend: from rear to front
             if t == 0:
                 turn = (heading[k] - along + np.pi) % (2.0 * np.pi) - np.pi
                 turn = min(max(turn, -0.8), 0.8)
@@ -234,17 +234,17 @@ def roll_one(
 ) -> Floats:
     """One vehicle on each of k paths.
 
-    Where it stands more than `beside` m off the path the gap closes with `change` m/s (a lane change, new or
-    under way), else with `settle`.
+    An offset of more than `beside` m from the path closes with `change` m/s (a lane change, new or under
+    way), a smaller one with `settle`.
 
     Args:
         points, arc, start: k packed paths (`Paths`).
         now: [8] KINEMATIC_FEATURES in the world (m, m/s, rad).
-        around: m, arc of its front along every path, about.
+        around: m, approximate arc of its front along every path.
         speed: [k,T+1] m/s.
         beside: m.
         change, settle: m/s.
-        brake: m/s2 in front of a stop (there is none).
+        brake: m/s2 before a stop (unused: there is no stop).
         dt: s between frames.
 
     Returns:

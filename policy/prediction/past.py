@@ -1,9 +1,9 @@
-"""The known past of every vehicle, completed to whole histories: predictors are fitted on nothing shorter.
+"""The known past of every vehicle, completed to whole histories, because predictors are fitted on those only.
 
-A vehicle that came into view two frames ago has a past too, only an unknown one. A predictor fitted on
-complete histories only does not learn what missing frames mean: with one known frame the fitted
-prior erred by three times constant speed. So what is not known is taken to have been as the two oldest known
-frames show; with a single one, constant speed (measured on tuning seeds, docs/explanation/prediction.md).
+A vehicle that came into view two frames ago has an unknown past. A predictor fitted on complete histories
+does not learn the meaning of missing frames: with one known frame the fitted prior has three times the error
+of constant speed. Unknown frames are therefore extrapolated from the two oldest known frames, and with a
+single known frame at constant speed (measured on validation seeds, docs/explanation/prediction.md).
 """
 
 import numpy as np
@@ -11,12 +11,12 @@ import numpy as np
 from cosim.geometry.compiled import compiled
 from cosim.types import Bools, Floats, Ints
 
-ORDINARY = 3.0  # m/s2: who brakes harder than this now has hardly done so for two seconds
+MAX_PAST_ACCEL = 3.0  # m/s2: harder braking rarely lasts two seconds
 
 
 @compiled
 def trailing_run(state: Floats, valid: Bools) -> Ints:
-    """How many unbroken valid, finite frames lead up to now.
+    """The number of consecutive valid, finite frames up to now.
 
     Args:
         state: [V,N,>=4] oldest first.
@@ -41,14 +41,14 @@ def trailing_run(state: Floats, valid: Bools) -> Ints:
 def whole_past(state: Floats, run: Ints, frames: int, dt: float) -> Floats:
     """The past of every vehicle as a whole history, known or completed.
 
-    Speed (its slope within ORDINARY) and heading go back as the two oldest known frames show, nobody
-    reverses, and the places follow from both (P, eq. 9 backwards). A longer past is cut; zeros for a vehicle
-    that is not known now.
+    Speed (slope limited to MAX_PAST_ACCEL, never negative) and heading are extrapolated backwards from the
+    two oldest known frames; positions follow from both (P, eq. 9 backwards). A longer past is cut. Vehicles
+    not known now get zeros.
 
     Args:
         state: [V,N,>=4] x m, y m, speed m/s, heading rad, oldest first.
         run: [V] from `trailing_run`.
-        frames: of a whole history.
+        frames: length of a whole history.
         dt: s between frames.
 
     Returns:
@@ -66,7 +66,7 @@ def whole_past(state: Floats, run: Ints, frames: int, dt: float) -> Floats:
         gain = turn = 0.0
         if known > 1:
             gain = out[v, oldest + 1, 2] - out[v, oldest, 2]
-            gain = min(max(gain, -ORDINARY * dt), ORDINARY * dt)
+            gain = min(max(gain, -MAX_PAST_ACCEL * dt), MAX_PAST_ACCEL * dt)
             turn = out[v, oldest + 1, 3] - out[v, oldest, 3]
         for k in range(oldest - 1, -1, -1):
             x, y, speed, heading = out[v, k + 1]

@@ -1,4 +1,4 @@
-"""Kinematic predictors by name: P's eight, none at all (`hold`), and a user's own."""
+"""Kinematic predictors by name: P's eight, no prediction (`hold`), and a user's class."""
 
 from collections.abc import Callable
 from functools import partial
@@ -25,9 +25,9 @@ MASK_PREDICTORS: dict[str, Callable[[int, float], Predictor]] = {"hold": Hold, *
 
 
 def make_predictor(name: str, horizon: int, dt: float) -> Predictor:
-    """A predictor `horizon` frames of `dt` s ahead: of the table, or the class FILE.py:NAME or MODULE:NAME.
+    """A predictor for `horizon` frames of `dt` s: from the table, or the class FILE.py:NAME or MODULE:NAME.
 
-    Raises BadInput: there is none of that name; the user's cannot be loaded or called, or lacks something.
+    Raises BadInput for an unknown name, or a user's class that cannot be loaded or called or is incomplete.
     """
     if not code.is_code(name):
         return MASK_PREDICTORS[one_of(name, MASK_PREDICTORS, "predictor")](horizon, dt)

@@ -1,4 +1,4 @@
-"""Where the others go: every vehicle's predicted speed carried along its real lane."""
+"""Predicted traffic: every vehicle's predicted speed carried along its real lane."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -15,15 +15,15 @@ from policy.prediction.protocol import Predictor
 
 @dataclass(frozen=True, slots=True)
 class TrafficConfig:
-    """How others are carried along their lanes."""
+    """The model of other vehicles' motion along their lanes."""
 
     dt: float = 0.2  # s
-    drift_rate: float = 0.4  # m/s sideways, above which a vehicle is changing lanes
-    drift_offset: float = 0.2  # m from the centre line, below which nobody is changing lanes yet
-    drift_limits: tuple[float, float] = (0.8, 2.4)  # m/s sideways of a change; SUMO's takes 1.6 m/s
-    settle_rate: float = 0.3  # m/s with which a resting offset closes
-    stop_brake: float = 4.0  # m/s2 towards the end of a lane
-    speed_factor: float = 1.2  # nobody is predicted faster than this times the limit (or as fast as now)
+    drift_rate: float = 0.4  # m/s, lateral speed from which a vehicle counts as changing lanes
+    drift_offset: float = 0.2  # m from the centre line, below which no vehicle counts as changing lanes
+    drift_limits: tuple[float, float] = (0.8, 2.4)  # m/s, lateral speed of a lane change; SUMO's is 1.6 m/s
+    settle_rate: float = 0.3  # m/s, lateral speed at which a remaining offset closes
+    stop_brake: float = 4.0  # m/s2, deceleration towards the end of a lane
+    speed_factor: float = 1.2  # cap of predicted speeds: this times the limit (or the present speed)
 
 
 class Traffic(NamedTuple):
@@ -33,21 +33,21 @@ class Traffic(NamedTuple):
     length: Floats  # [V] m
     width: Floats  # [V] m
     stream: tuple[LanePath | None, ...]  # [V] the path each follows (its target lane's, when changing)
-    drifting: Bools  # [V] changes lanes now
+    drifting: Bools  # [V] changing lanes now
     known: Bools  # [V] perceived in the newest frame
 
 
 def foresee(
     scene: Scene, predictor: Predictor, road: RoadMap, config: TrafficConfig, frames: int | None = None
 ) -> tuple[KinematicForecast, Traffic]:
-    """The predictor's forecast of every vehicle of a scene, and the same carried along the lanes.
+    """The predictor's forecast of every vehicle of a scene, and its speeds carried along the lanes.
 
     Args:
-        scene: what the AVs know.
+        scene: the AVs' joined knowledge.
         predictor: forecasts `predictor.horizon` frames.
         road: the road map.
-        config: how vehicles are carried along their lanes.
-        frames: how far they are carried (default: the predictor's horizon).
+        config: the model of motion along the lanes.
+        frames: length of the rollout (default: the predictor's horizon).
     """
     forecast = predictor.predict(scene.state, scene.valid)
     return forecast, predict_traffic(scene, forecast, road, config, frames or predictor.horizon)
@@ -58,19 +58,19 @@ def predict_traffic(
 ) -> Traffic:
     """Carry the forecast speeds along the lanes for `frames` frames (beyond the forecast: its last speed).
 
-    A vehicle keeps its lane and takes the straightest way (its route is unknown); one that drifts sideways
-    goes where it drifts, so a merging car sits in the neighbour lane only once it really moves there; where
-    the lane ends it stops. Vehicles off every lane go where the forecast says.
+    A vehicle keeps its lane and follows the straightest path (its route is unknown). A vehicle with lateral
+    motion is predicted into the adjacent lane; a merging car therefore appears there only after it starts to
+    move. At the end of a lane vehicles stop. Vehicles off every lane follow the forecast.
 
     Args:
-        scene: what the AVs know.
-        forecast: [V,M] of its vehicles, in the world.
+        scene: the AVs' joined knowledge.
+        forecast: [V,M] of its vehicles, in world coordinates.
         road: the road map.
-        config: how vehicles are carried along their lanes.
+        config: the model of motion along the lanes.
         frames: of `config.dt` s.
 
     Returns:
-        the rollout [V,frames+1] of every vehicle, frame 0 is now.
+        the rollout [V,frames+1] of every vehicle; frame 0 is now.
     """
     c = config
     count = len(scene.vehicles)
@@ -87,13 +87,13 @@ def predict_traffic(
     scale = np.array([p.scale for p in paths])
     arc = scene.lane_position[on_lane] * scale  # m, front bumper
     offset, drift = _sideways(scene, on_lane, paths, arc, c)
-    aim = np.zeros(len(lanes))  # m beside the path
+    aim = np.zeros(len(lanes))  # m, lateral offset from the path
     for i, k in enumerate(lanes):
         beside = road.lanes[k].left if offset[i] > 0.0 else road.lanes[k].right
         if drift[i] * offset[i] > 0.0:  # moving away from its own centre line
             if beside >= 0:
                 paths[i] = road.path(beside)
-            else:  # inside junctions lanes know no neighbours
+            else:  # inside junctions lanes have no neighbours
                 aim[i] = np.copysign(max(road.lanes[k].width, abs(offset[i])), offset[i])
     packed = pack(paths)
     arc, offset = project_many(*packed, *fronts(now[on_lane]), arc)
@@ -130,8 +130,8 @@ def predict_traffic(
 def _sideways(
     scene: Scene, rows: np.ndarray, paths: list[LanePath], arc: Floats, c: TrafficConfig
 ) -> tuple[Floats, Floats]:
-    """The front's offset from the own centre line [k] m, and its sideways speed [k] m/s (0 unless it is a
-    lane change)."""
+    """The front's offset from its centre line [k] m, and its lateral speed [k] m/s (0 without a lane
+    change)."""
     packed = pack(paths)
     _, offset = project_many(*packed, *fronts(scene.state[rows, -1]), arc)
     back = min(2, scene.state.shape[1] - 1)

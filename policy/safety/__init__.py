@@ -1,4 +1,4 @@
-"""The safety prioritizer (P, algorithms 2 and 3): masks the actions that would lead to a collision."""
+"""The safety prioritizer (P, algorithms 2 and 3): a mask of actions that would lead to a collision."""
 
 from policy.safety.config import SafetyConfig, Thresholds
 from policy.safety.maneuver import LANE_END

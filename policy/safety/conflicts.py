@@ -13,15 +13,15 @@ from policy.inputs.scene import Scene
 from policy.prediction.motion import Rollout, project_each
 from policy.prediction.traffic import Traffic
 from policy.safety.config import SafetyConfig
-from policy.safety.maneuver import Ways
+from policy.safety.maneuver import ActionPaths
 
 
 class Others(NamedTuple):
-    """The O vehicles that an AV knows and can touch."""
+    """The O vehicles known to an AV and within its reach."""
 
-    rows: Ints  # [O] places in the scene
+    rows: Ints  # [O] indices into the scene
     boxes: Boxes  # [O,T+1] frame 0 is now
-    intended: Bools  # [O] moves by a shared intention, not by a prediction
+    intended: Bools  # [O] motion is a shared intention, not a prediction
 
 
 def others_near(
@@ -34,15 +34,15 @@ def others_near(
     intended: Bools,
     way: tuple[int, ...] = (),
 ) -> Others:
-    """The vehicles that an AV can touch: its own rows; with shared perception also its allies' rows.
+    """The vehicles within an AV's reach: its own rows; with shared perception also the other AVs' rows.
 
     Args:
-        b: place of the AV among `scene.agents`.
-        me: its place among `scene.vehicles`.
+        b: index of the AV in `scene.agents`.
+        me: its index in `scene.vehicles`.
         scene, traffic, road: as in `policy.safety.prioritize`.
         c: limits.
-        intended: [V] whose rollout is a shared intention.
-        way: the lanes that the AV drives on to.
+        intended: [V] the rollout is a shared intention.
+        way: the lanes ahead on the AV's paths.
     """
     r = traffic.rollout
     if scene.shared:
@@ -61,7 +61,7 @@ def others_near(
 
 @compiled
 def _within(me: int, x: Floats, y: Floats, known: Bools, reach: float, number: Ints, touch: Bools) -> Ints:
-    """The known ones of V vehicles x, y [V] less than `reach` m from `me` whose roads touch its own."""
+    """Known vehicles of x, y [V] less than `reach` m from `me` on roads connected to its own."""
     out = np.empty(len(x), np.int64)
     count = 0
     for v in range(len(x)):
@@ -77,7 +77,7 @@ def _within(me: int, x: Floats, y: Floats, known: Bools, reach: float, number: I
 def _along(
     rows: Ints, me: int, heading: Floats, lane: npt.NDArray[np.int32], way: Ints, same_way: float
 ) -> Ints:
-    """Which of the rows [O] drive as `me` does, or on a lane of its way; heading [V] rad, lane [V]."""
+    """Rows [O] in the direction of `me` or on a lane of its path; heading [V] rad, lane [V]."""
     chosen = np.zeros(len(rows), np.bool_)
     for k, v in enumerate(rows):
         turn = heading[v] - heading[me]
@@ -88,14 +88,14 @@ def _along(
 
 
 def first_contact(ego: Rollout, length: float, width: float, others: Others, c: SafetyConfig) -> Floats:
-    """When the ego's box first touches each other's (P, algorithm 2).
+    """Time of first contact between the ego's box and each other box (P, algorithm 2).
 
-    Between two frames both boxes keep their velocity, so nothing is jumped over.
+    Boxes are swept at constant velocity between frames, so no contact is missed.
 
     Args:
         ego: [A,T+1] its futures.
         length, width: m, of its box.
-        others: the O vehicles near it.
+        others: the O vehicles near the ego.
         c: margins and time step.
 
     Returns:
@@ -103,7 +103,7 @@ def first_contact(ego: Rollout, length: float, width: float, others: Others, c: 
     """
     mine = Boxes(ego.x, ego.y, ego.heading, length + c.margin_length, width + c.margin_width, ego.speed)
     touch = first_contacts(mine, others.boxes, c.dt)
-    close = (touch == 0.0).any(0)  # within the margin already: only without the margins do actions differ
+    close = (touch == 0.0).any(0)  # inside the margin already: margins would make all actions equal
     if close.any():
         exact = mine._replace(length=length, width=width)
         touch[:, close] = first_contacts(exact, _only(others.boxes, close), c.dt)
@@ -115,22 +115,22 @@ def _only(boxes: Boxes, which: Bools | Ints) -> Boxes:
 
 
 class Neighbours(NamedTuple):
-    """The others as they stand now to the path of every action."""
+    """Present positions of the others relative to the path of every action."""
 
-    in_lane: Bools  # [A,O] in the path's lane, or moving into it
+    in_lane: Bools  # [A,O] in the path's lane or moving into it
     gap: Floats  # [A,O] m, bumper to bumper; negative when side by side
-    ahead: Bools  # [A,O] drives before the ego
-    behind: Bools  # [A,O] follows the ego in this lane
+    ahead: Bools  # [A,O] ahead of the ego
+    behind: Bools  # [A,O] behind the ego in this lane
 
 
 def neighbours(
-    course: Ways, arc: Floats, heading: float, length: float, others: Others, c: SafetyConfig
+    course: ActionPaths, arc: Floats, heading: float, length: float, others: Others, c: SafetyConfig
 ) -> Neighbours:
-    """How the others stand to the path of every action.
+    """Present positions of the others relative to the path of every action.
 
     Args:
         course: the paths.
-        arc: [A] m, place of the ego's centre on each of them.
+        arc: [A] m, arc of the ego's centre on each path.
         heading: rad, of the ego.
         length: m, of the ego.
         others: the O vehicles near it.
@@ -138,21 +138,21 @@ def neighbours(
     """
     paths, same = course.paths, course.same
     x, y, headings, lengths = (np.asarray(array) for array in others.boxes[:4])
-    soon = min(5, x.shape[1] - 1)  # 1 s ahead: who drifts in is in
+    soon = min(5, x.shape[1] - 1)  # 1 s ahead: a vehicle moving in counts as in the lane
     theirs, offset = project_each(*paths, same, x[:, 0], y[:, 0])
     _, later = project_each(*paths, same, x[:, soon], y[:, soon])
-    stand = _stand(
+    stand = _positions(
         *(theirs, offset, later, arc, heading, length), headings[:, 0], lengths, c.same_way, c.lane_half
     )
     return Neighbours(*stand)
 
 
 @compiled
-def _stand(
-    theirs: Floats,  # [A,O] m, place along each path
-    offset: Floats,  # [A,O] m beside it, now
-    later: Floats,  # [A,O] m beside it, soon
-    arc: Floats,  # [A] m, the ego's place
+def _positions(
+    theirs: Floats,  # [A,O] m, arc along each path
+    offset: Floats,  # [A,O] m, present lateral offset
+    later: Floats,  # [A,O] m, lateral offset in 1 s
+    arc: Floats,  # [A] m, arc of the ego
     heading: float,
     length: float,
     headings: Floats,  # [O] rad
@@ -179,25 +179,24 @@ def _stand(
 def gap_margin(
     stopping: Floats, speed: float, changes: Bools, near: Neighbours, others: Others, c: SafetyConfig
 ) -> tuple[Floats, Ints]:
-    """The score [A] s that the gaps around the ego leave, and which of the others limits it [A].
+    """The score [A] s from the gaps around the ego, and the limiting vehicle [A].
 
-    Leader: if it brakes with `leader_brake` from now on, and the ego as hard as it can from its next decision
-    on, they must not touch; one that shares its intentions brakes no earlier than they say. A lane change
-    further needs the place beside the ego, and a new follower that need not brake harder than
-    `follower_brake`. At the limit the score is safe_th, below it falls with the gap. Decelerating never makes
-    a gap smaller.
+    Leader: it brakes with `leader_brake` from now on, the ego fully from its next decision on, and they must
+    not touch. A leader with shared intentions brakes no earlier than it announced. A lane change also needs
+    free space beside the ego, and must not make the new follower brake harder than `follower_brake`. At the
+    limit the score is safe_th, below it the score falls with the gap. Decelerating never makes a gap smaller.
 
     Args:
-        stopping: [A] m, the ego's way to standstill.
-        speed: its speed now, m/s.
-        changes: [A] leads to another lane.
-        near: how the others stand to the path of every action.
+        stopping: [A] m, the ego's stopping distance.
+        speed: present speed of the ego, m/s.
+        changes: [A] the action changes lanes.
+        near: positions of the others relative to the path of every action.
         others: the O vehicles near it.
         c: limits.
     """
     speeds = np.asarray(others.boxes.speed)
     soon = speeds[:, min(round(c.reaction / c.dt), speeds.shape[1] - 1)]
-    ratio, who = _tightest(
+    ratio, tightest = _tightest(
         stopping,
         speed,
         changes,
@@ -212,7 +211,7 @@ def gap_margin(
         c.follower_reaction,
         c.follower_brake,
     )
-    return np.where(ratio >= 1.0, np.inf, 0.999 * c.safe_th * np.maximum(ratio, 0.0)), who
+    return np.where(ratio >= 1.0, np.inf, 0.999 * c.safe_th * np.maximum(ratio, 0.0)), tightest
 
 
 _DECELERATE = int(MetaAction.DECELERATE)
@@ -237,14 +236,14 @@ def _tightest(
     follower_reaction: float,
     follower_brake: float,
 ) -> tuple[Floats, Ints]:
-    """Smallest ratio of the gap there is to the gap needed [A], and whose [A]; see `gap_margin`."""
+    """Smallest ratio of actual to required gap [A], and the limiting vehicle [A]; see `gap_margin`."""
     actions, count = gap.shape
-    best, who = np.full(actions, np.inf), np.zeros(actions, np.int64)
+    best, tightest = np.full(actions, np.inf), np.zeros(actions, np.int64)
     for a in range(actions):
         for k in range(count):
             ratio = np.inf
             if a != _DECELERATE and ahead[a, k]:
-                braking = soon[k] if intended[k] else speed[k]  # m/s when it begins to brake hard
+                braking = soon[k] if intended[k] else speed[k]  # m/s at the start of hard braking
                 theirs = braking * braking / (2 * leader_brake)
                 if intended[k]:
                     theirs += 0.5 * (speed[k] + soon[k]) * reaction
@@ -257,5 +256,5 @@ def _tightest(
                 if in_lane[a, k] and gap[a, k] < standstill_gap:
                     ratio = 0.0
             if ratio < best[a]:
-                best[a], who[a] = ratio, k
-    return best, who
+                best[a], tightest[a] = ratio, k
+    return best, tightest

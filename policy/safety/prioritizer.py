@@ -1,13 +1,13 @@
-"""The safety prioritizer (P, algorithms 2 and 3): masks the actions that would lead to a collision.
+"""The safety prioritizer (P, algorithms 2 and 3): a mask of actions that would lead to a collision.
 
-Algorithm 2 rolls the ego out under each meta-action along its real lane centre lines, the others by their
-predicted speeds along theirs, and finds when their (swept, oriented) boxes first touch. With first contact
-at T, the time to collision at step h of the horizon is T - h, capped. A car ahead in the own lane counts only
-if braking a little later would touch it as well: who can follow need not fall back. Two further limits look
-at what a time to collision cannot see, because it is infinite at equal speeds: a leader that brakes hard, and
-the new follower that a lane change asks to brake. Algorithm 3 takes the best action that is left.
+Algorithm 2 rolls the ego out under each meta-action along its real lane centre lines, and the others at their
+predicted speeds along theirs. It finds the first contact of their (swept, oriented) boxes. With first contact
+at T, the time to collision at step h of the horizon is T - h, capped. A vehicle ahead in the own lane counts
+only if slightly later braking would touch it as well, so that normal following is safe. Two further limits
+cover cases of equal speed, where the time to collision is infinite: a leader that brakes hard, and a new
+follower that has to brake for a lane change. Algorithm 3 takes the best remaining action.
 
-AVs decide front to back, each knowing the rollouts chosen before it (V2V intentions, switchable).
+AVs decide front to back; each knows the rollouts chosen before it (V2V intentions, switchable).
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,20 +26,20 @@ from policy.safety.config import SafetyConfig
 from policy.safety.conflicts import Others, first_contact, gap_margin, neighbours, others_near
 from policy.safety.maneuver import (
     ACTIONS,
-    KEEPING,
+    HELD_ACTIONS,
     LANE_END,
     REFUSED,
     STRADDLING,
     TOO_SLOW,
+    ActionPath,
+    ActionPaths,
     Futures,
-    Way,
-    Ways,
     at_lane_end,
     packed,
+    paths_of_actions,
     roll_braked,
     roll_ego,
     straddling,
-    ways_of,
 )
 
 
@@ -49,7 +49,7 @@ class Evaluation(NamedTuple):
     ttc: Floats  # [A] s until first contact under the action, capped
     score: Floats  # [A] s, P's weighted time to collision; -1 for impossible actions
     unsafe: Bools  # [A]
-    blamed: tuple[str | None, ...]  # [A] who makes it unsafe
+    blamed: tuple[str | None, ...]  # [A] vehicle or reason that makes it unsafe
     futures: Futures  # the ego under each action
 
 
@@ -66,15 +66,15 @@ def prioritize(
 
     Args:
         q: [B,A] action values, in the order of `scene.agents`.
-        scene: what the AVs know (`policy.inputs.scene.join`).
-        traffic: where everybody in it goes, `config.frames` frames of `config.dt` s ahead; not changed.
+        scene: the AVs' joined knowledge (`policy.inputs.scene.join`).
+        traffic: predicted traffic, `config.frames` frames of `config.dt` s ahead; not modified.
         road: the road map.
         config: thresholds and driving limits.
         share_intentions: V2V: the chosen rollouts of the AVs ahead replace their predictions.
-        refused: AV -> the lane change just found impossible.
+        refused: AV -> lane change that was just refused.
 
     Returns:
-        AV -> decision with action, safety scores [A] s, mask [A] and who is to blame for it.
+        AV -> decision with action, safety scores [A] s, mask [A] and the reason for each masked action.
 
     Raises:
         ValueError: `traffic` does not reach `config.frames` frames ahead.
@@ -84,12 +84,12 @@ def prioritize(
     ours = Rollout(*(array.copy() for array in traffic.rollout)) if share_intentions else traffic.rollout
     traffic = traffic._replace(rollout=ours)
     intended = np.zeros(len(scene.vehicles), np.bool_)
-    copies = _copies(scene)
+    copies = _scene_indices(scene)
     decisions: dict[str, Decision] = {}
     for b in front_to_back(scene, config):
         no = refused.get(scene.agents[b]) if refused else None
         evaluation = evaluate(b, scene, traffic, road, config, intended, no)
-        decision = select(q[b], evaluation, config, _ties(scene.histories[b], config))
+        decision = select(q[b], evaluation, config, _tie_order(scene.histories[b], config))
         decisions[scene.agents[b]] = decision
         if share_intentions:
             me = copies[scene.agents[b]]
@@ -99,9 +99,9 @@ def prioritize(
     return {agent: decisions[agent] for agent in scene.agents}
 
 
-def _copies(scene: Scene) -> dict[str, list[int]]:
-    """AV -> its places among the vehicles: with pooled knowledge one, else one for each AV that hears of its
-    intentions, and its own."""
+def _scene_indices(scene: Scene) -> dict[str, list[int]]:
+    """AV -> its indices among the vehicles: one with pooled knowledge, else its own and one per AV that
+    receives its intentions."""
     if scene.shared:
         return {name: [k] for k, name in enumerate(scene.vehicles)}
     found: dict[str, list[int]] = {name: [] for name in scene.agents}
@@ -112,8 +112,8 @@ def _copies(scene: Scene) -> dict[str, list[int]]:
     return found
 
 
-def _ties(history: History, c: SafetyConfig) -> tuple[MetaAction, ...]:
-    """Order of equally valued actions: an AV that once gave way does not crawl or stand for ever."""
+def _tie_order(history: History, c: SafetyConfig) -> tuple[MetaAction, ...]:
+    """Order of equally valued actions, chosen so that an AV speeds up again after giving way."""
     if history.target_speed < c.resume_below * history.route.speed_limit:
         return (MetaAction.ACCELERATE, *(a for a in c.ties if a != MetaAction.ACCELERATE))
     return c.ties
@@ -126,7 +126,7 @@ def select(
 
     Args:
         q: [A] action values.
-        evaluation: of this AV (`evaluate`).
+        evaluation: from `evaluate`, for this AV.
         config: thresholds.
         ties: the order of equally valued actions (default: the configured one).
     """
@@ -135,7 +135,7 @@ def select(
     preferred = order[0]
     chosen = next((a for a in order if not evaluation.unsafe[a]), None)
     fallback = chosen is None
-    if chosen is None:  # equal scores: better slower than as preferred
+    if chosen is None:  # equal scores: the slower action first
         chosen = max(order, key=lambda a: (float(evaluation.score[a]), a == MetaAction.DECELERATE))
     return Decision(
         chosen,
@@ -161,19 +161,19 @@ def evaluate(
     """Times to collision and safety scores of all five actions of one AV (P, algorithm 2).
 
     Args:
-        b: place of the AV among `scene.agents`.
+        b: index of the AV in `scene.agents`.
         scene, traffic, road, config: as in `prioritize`.
-        intended: [V] whose rollout is a shared intention, not a prediction.
-        refused: a lane change found impossible.
+        intended: [V] the rollout is a shared intention, not a prediction.
+        refused: lane change that was just refused.
     """
     c, history = config, scene.histories[b]
     me = int(scene.ego[b])
-    ways = ways_of(history, road, int(scene.lane[me]))
+    ways = paths_of_actions(history, road, int(scene.lane[me]))
     course = packed(tuple(way.path for way in ways))
     futures = roll_ego(history, course.paths, scene.state[me, -1], c)
     ego = Rollout(*(array[: len(ACTIONS)] for array in futures.under))
-    others = others_near(b, me, scene, traffic, road, c, intended, ways[KEEPING[0]].path.lanes)
-    contact, limit, blamed = _met(history, ways, course, futures.stopping, ego, others, scene, me, c)
+    others = others_near(b, me, scene, traffic, road, c, intended, ways[HELD_ACTIONS[0]].path.lanes)
+    contact, limit, blamed = _contacts(history, ways, course, futures.stopping, ego, others, scene, me, c)
     for a in map(int, straddling(ego, c)):
         if 0.9 * c.safe_th < limit[a]:
             limit[a] = 0.9 * c.safe_th
@@ -194,14 +194,14 @@ def evaluate(
             forbidden = REFUSED
         if forbidden is not None:
             unsafe[a], score[a], blamed[a] = True, -1.0, forbidden
-    who = tuple(name if bad else None for name, bad in zip(blamed, unsafe, strict=True))
-    return Evaluation(np.minimum(contact, c.cap), score, unsafe, who, futures)
+    reasons = tuple(name if bad else None for name, bad in zip(blamed, unsafe, strict=True))
+    return Evaluation(np.minimum(contact, c.cap), score, unsafe, reasons, futures)
 
 
-def _met(
+def _contacts(
     history: History,
-    ways: list[Way],
-    course: Ways,
+    ways: list[ActionPath],
+    course: ActionPaths,
     stopping: Floats,
     ego: Rollout,
     others: Others,
@@ -209,8 +209,8 @@ def _met(
     me: int,
     c: SafetyConfig,
 ) -> tuple[Floats, Floats, list[str | None]]:
-    """Whom each action meets: first contact [A] s, the score [A] s that leader and follower allow (both inf
-    for nobody), and who it is [A]."""
+    """Per action: first contact [A] s, the score [A] s from leader and follower (both inf without one), and
+    the responsible vehicle [A]."""
     count = len(ACTIONS)
     if not len(others.rows):
         return np.full(count, np.inf), np.full(count, np.inf), [None] * count
@@ -218,20 +218,20 @@ def _met(
     length, width = float(now[4]), float(now[5])
     near = neighbours(course, ego.arc[:, 0] - 0.5 * length, float(now[3]), length, others, c)
     times = first_contact(ego, length, width, others, c)  # [A,O] s
-    times[near.behind] = np.inf  # followers brake: a change asks by `gap_margin` whether they must
-    held, ahead = times[KEEPING], near.ahead[KEEPING]
+    times[near.behind] = np.inf  # followers are assumed to brake; `gap_margin` checks them for lane changes
+    held, ahead = times[HELD_ACTIONS], near.ahead[HELD_ACTIONS]
     if c.assisted:
-        times[KEEPING] = held = np.where(ahead, np.inf, held)
+        times[HELD_ACTIONS] = held = np.where(ahead, np.inf, held)
     if c.brake_after < c.frames * c.dt and np.isfinite(held[ahead]).any():
-        braked = roll_braked(history, ways[KEEPING[0]].path, now, ego, KEEPING, c)
+        braked = roll_braked(history, ways[HELD_ACTIONS[0]].path, now, ego, HELD_ACTIONS, c)
         late = first_contact(braked, length, width, others, c)
-        times[KEEPING] = np.where(ahead, np.maximum(held, late), held)
+        times[HELD_ACTIONS] = np.where(ahead, np.maximum(held, late), held)
     first = times.argmin(1)
     contact = times[np.arange(count), first]
     changes = np.array([way.changes for way in ways])
     limit, tightest = gap_margin(stopping, float(now[2]), changes, near, others, c)
     if c.assisted:
-        limit[KEEPING] = np.inf
+        limit[HELD_ACTIONS] = np.inf
     blamed: list[str | None] = [None] * count
     for a in range(count):
         if contact[a] > c.horizon + c.critical_th and limit[a] < c.safe_th:
@@ -250,17 +250,17 @@ def _weights(c: SafetyConfig) -> tuple[Floats, Floats, float]:
 
 
 def front_to_back(scene: Scene, config: SafetyConfig) -> list[int]:
-    """The order in which AVs decide: always the one with the fewest undecided AVs ahead of it.
+    """The decision order: always next is the AV with the fewest undecided AVs ahead of it.
 
-    `a` is ahead of `b` when it lies before b's nose and drives the same way; on crossing ways the one that is
-    nearer to the conflict zone is. Equal counts go by id.
+    `a` is ahead of `b` when it is in front of b and drives in the same direction; on crossing paths the AV
+    nearer to the conflict zone is ahead. Ties are broken by id.
     """
     count = len(scene.agents)
     x, y, heading = scene.pose.T
     dx, dy = x[None, :] - x[:, None], y[None, :] - y[:, None]  # [b,a] of a as seen from b
     ahead_by = dx * np.cos(heading)[:, None] + dy * np.sin(heading)[:, None]
     turn = np.abs((heading[None, :] - heading[:, None] + np.pi) % (2 * np.pi) - np.pi)
-    near = dx * dx + dy * dy < 150.0**2  # m: further away nobody matters
+    near = dx * dx + dy * dy < 150.0**2  # m, range of the comparison
     conflict = np.array([h.route.conflict_distance for h in scene.histories])
     same = turn < config.same_way
     ahead = near & np.where(same, ahead_by > 0.0, conflict[None, :] < conflict[:, None])

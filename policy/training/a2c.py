@@ -17,14 +17,14 @@ class A2cConfig:
     """Optimisation. T gives none of these: usual values."""
 
     learning_rate: float = 3e-4
-    keep: int = 1  # decisions that what is drawn is kept: nobody opens a gap within one of 0.4 s
-    n_step: int = 8  # as the DDQN's (docs/guides/training.md); 1 is the papers'
+    keep: int = 1  # decisions that a drawn action is repeated: a gap takes longer than one of 0.4 s
+    n_step: int = 8  # as for DDQN (docs/guides/training.md); the papers: 1
     gamma: float = 0.97  # a decision of 0.4 s
     batch: int = 64
-    passes: int = 1  # over what an iteration drove; 1 is A2C
-    entropy: float = 0.01  # keeps the policy from closing up early
+    passes: int = 1  # over an iteration's trajectories; 1 is A2C
+    entropy: float = 0.01  # weight, against premature convergence
     critic: float = 0.5  # weight of the value loss
-    scale: float = 0.1  # of all rewards, as the DDQN's
+    scale: float = 0.1  # factor on all rewards, as for DDQN
     normalize: bool = False  # advantages to mean 0 and deviation 1 over a batch
     clip: float = 0.5  # largest gradient norm
 
@@ -38,17 +38,17 @@ class A2cConfig:
 
 
 class A2cLearner(Learner):
-    """Actor and critic over one extractor, with their optimiser."""
+    """Actor and critic on a shared extractor, with their optimiser."""
 
     config: A2cConfig
 
     def learn(self, drives: Sequence[Trajectory], rng: np.random.Generator) -> Metrics:
         """`config.passes`, each in random order, over trajectories driven with the present weights.
 
-        Of `config.keep` decisions with the same drawn action the first is learned from.
+        Of `config.keep` decisions with the same drawn action only the first is a sample.
 
         Returns the means of `policy`, `value` and `entropy` (nat), and `explained_variance`, the share of the
-        returns' variance that the critic had foretold; nothing when there are no transitions.
+        returns' variance that the critic predicted; empty without transitions.
         """
         c = self.config
         drawn = [(t, np.arange(0, len(t), c.keep)) for t in drives]
@@ -66,8 +66,8 @@ class A2cLearner(Learner):
         return mean_metrics(losses) | {"explained_variance": explained}
 
     def _returns(self, drive: Trajectory, begins: np.ndarray) -> tuple[Floats32, Floats32]:
-        """Of the decisions `begins` [K]: n-step returns, bootstrapped by the critic unless the drive ended in
-        a crash before; and what the critic foretold."""
+        """For the decisions `begins` [K]: n-step returns, bootstrapped by the critic unless the episode ended
+        in a crash before; and the critic's values."""
         c, d = self.config, len(drive)
         ends = np.minimum(begins + c.n_step, d)
         asked = np.union1d(begins, ends)

@@ -21,7 +21,7 @@ SIZES = {"compact": COMPACT, "paper": PAPER, "smoke": SMOKE}  # of the maps
 
 @dataclass(frozen=True, slots=True)
 class TrainingFile:
-    """The sections of a configuration file; whatever it leaves out keeps the compact default."""
+    """The sections of a configuration file; missing sections keep the compact default."""
 
     observation: Literal["compact", "paper", "smoke"] = "compact"  # `SIZES`
     chain: Hypotheses = field(default_factory=Hypotheses)
@@ -42,13 +42,13 @@ def agent_config(name: str, file: TrainingFile) -> AgentConfig:
 
 
 def encoder_of(file: TrainingFile) -> EncoderConfig:
-    """The frame encoder for the maps of `file`, with as many numbers a frame as its value network takes."""
+    """The frame encoder for the maps of `file`, with the latent size of its value network."""
     seen = SIZES[file.observation]
     return EncoderConfig(seen.height, seen.width)
 
 
 def described(name: str, agent: AgentConfig, file: TrainingFile) -> dict[str, Any]:
-    """What the card of the approach's weights says of the agent, its rewards and its exploration."""
+    """The card's description of agent, rewards and exploration for the approach's weights."""
     parts = ("observation", "hpn", "chain", "safety", "traffic")
     about: dict[str, Any] = {part: asdict(getattr(agent, part)) for part in parts}
     about["predictor"] = agent.predictor

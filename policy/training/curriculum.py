@@ -1,4 +1,4 @@
-"""The schedule of drives: lessons, seeds, exploration and who drives, all drawn from one seed."""
+"""The schedule of training episodes: lessons, seeds, exploration and weights, all drawn from one seed."""
 
 import math
 from collections.abc import Sequence
@@ -15,12 +15,12 @@ from policy.training.ddqn import DdqnConfig
 from policy.training.experience import Trajectory
 from policy.training.replay_buffer import ReplayConfig
 
-WAITS = 0.9  # of the replay buffer: whole drives leave it, so that it is never quite full
+MAX_PREFILL_SHARE = 0.9  # of the capacity: whole trajectories leave, so the buffer never fills up
 
 
 @dataclass(frozen=True, slots=True)
 class Lesson:
-    """One kind of episode and how often it is driven."""
+    """One kind of episode and its sampling weight."""
 
     scenario: str
     demand: str = "contested"
@@ -30,95 +30,95 @@ class Lesson:
 
 @dataclass(frozen=True, slots=True)
 class OnPolicy:
-    """What A2C has besides. T gives none of these."""
+    """Additional options of A2C. T gives none of these."""
 
-    keep: int = 1  # decisions that what is drawn is kept: no gap opens within one of 0.4 s
-    n_step: int = 8  # decisions of a return; 1 is the papers'
-    passes: int = 1  # over what an iteration drove; 1 is A2C
-    entropy: float = 0.01  # weight: it keeps the policy from closing up early
+    keep: int = 1  # decisions that a drawn action is repeated: a gap takes longer than one of 0.4 s
+    n_step: int = 8  # decisions of a return; the papers: 1
+    passes: int = 1  # over an iteration's trajectories; 1 is A2C
+    entropy: float = 0.01  # weight, against premature convergence
 
 
 @dataclass(frozen=True, slots=True)
 class VfnTraining:
-    """One training run. Defaults: P's Table I where it has them, else what trains on two CPU cores."""
+    """One training run. Defaults: P's Table I where given, else suited to two CPU cores."""
 
     lessons: tuple[Lesson, ...] = (Lesson("merge"),)
     iterations: int = 400
     episodes: int = 2  # an iteration
-    updates: int = 40  # an iteration: one every five joint decisions; 4 to 8 do
-    prefill: int = 2_000  # decisions recorded before the first update (Alg. 4), with epsilon 1
+    updates: int = 40  # an iteration: one every five joint decisions; 4 to 8 work
+    prefill: int = 2_000  # decisions recorded with epsilon 1 before the first update (Alg. 4)
     epsilon: tuple[float, float] = (1.0, 0.05)  # P, Table I: linear
     epsilon_iterations: int = 200
     disseminate: int = 5  # iterations between copies of the learner's weights to the frozen AVs
     svo: tuple[float, ...] = (45.0, 60.0)  # deg, drawn per episode; (0,) trains an egoist
-    seed: int = 0  # of everything
+    seed: int = 0  # of the whole run
     validate_every: int = 20  # iterations; the last one is validated too
-    validation: int = 4  # episodes of every lesson, greedy, on tuning seeds
+    validation: int = 4  # greedy episodes of every lesson, on validation seeds
     save_every: int = 5  # iterations
     errors: str = ""  # of the human drivers: a level or a user's file; "": none
-    preset: str = Preset.UNGUARDED  # what the car does by itself (docs/reference/presets.md)
+    preset: str = Preset.UNGUARDED  # the car's own behaviour (docs/reference/presets.md)
     encoder: str = ""  # weights of `cosim train encoder`, for extractor `frames`: encoder, or a file
     learning_rate: float = 5e-4  # P, Table I
     gamma: float = 0.97  # a decision of 0.4 s; P: 0.95
     batch: int = 64  # P, Table I
     # DDQN
-    n_step: int = 8  # decisions of a return; 1 is P's
+    n_step: int = 8  # decisions of a return; P: 1
     target_every: int = 300  # P, Table I
-    refused: float = 1.0  # weight of the loss that makes refused actions worth a crash (P, algorithm 4)
+    refused: float = 1.0  # weight of the loss that values refused actions like a crash (P, algorithm 4)
     capacity: int = 30_000  # decisions in the replay buffer; P's 8,000 are 20 episodes of 4 learners
     interaction: float = 0.25  # share of a batch near a mission vehicle, or vetoed (P, algorithm 4)
-    relabel: float = 0.5  # share of a batch that is learned for another SVO than was driven
+    relabel: float = 0.5  # share of a batch relabelled with another SVO
     a2c: OnPolicy = field(default_factory=OnPolicy)
 
     def __post_init__(self) -> None:
-        """Raises BadInput: a number is out of range, or the replay buffer never holds what is waited for."""
+        """Raises BadInput for a number out of range, or a prefill that the replay buffer cannot hold."""
         in_range(
             self,
             positive="iterations episodes updates epsilon_iterations disseminate validate_every save_every",
             not_negative="prefill validation",
         )
-        _ = self.replay_config, self.ddqn_config, self.a2c_config  # each checks its numbers
-        if self.prefill > WAITS * self.capacity:
+        _ = self.replay_config, self.ddqn_config, self.a2c_config  # each validates its numbers
+        if self.prefill > MAX_PREFILL_SHARE * self.capacity:
             problem = f"nothing is learned before {self.prefill} decisions are kept"
             raise BadInput(problem, field="training.capacity", value=self.capacity)
 
     @property
     def replay_config(self) -> ReplayConfig:
-        """Of the replay buffer."""
+        """The replay buffer's configuration."""
         kept = self.capacity, self.batch, self.n_step, self.gamma, self.interaction, self.relabel
         return ReplayConfig(*kept)
 
     @property
     def ddqn_config(self) -> DdqnConfig:
-        """Of the DDQN learner."""
+        """The DDQN learner's configuration."""
         rate, every, refused = self.learning_rate, self.target_every, self.refused
         return DdqnConfig(learning_rate=rate, target_every=every, refused=refused)
 
     @property
     def a2c_config(self) -> A2cConfig:
-        """Of the A2C learner."""
+        """The A2C learner's configuration."""
         own = asdict(self.a2c)
         rate, gamma, batch = self.learning_rate, self.gamma, self.batch
         return A2cConfig(learning_rate=rate, gamma=gamma, batch=batch, normalize=True, **own)
 
 
 class Drive(NamedTuple):
-    """One episode to be driven; its outcome depends on nothing else."""
+    """One episode to be driven; these fields determine its outcome."""
 
     lesson: Lesson
     seed: int
     svo: float  # rad
     epsilon: float
     weights: str  # file of the learning AVs' network, "" for untrained
-    frozen: str  # file of the others'
-    record: bool  # False: validation, greedy, nothing is recorded
+    frozen: str  # file of the other AVs' network
+    record: bool  # False: validation, greedy and without recording
     errors: str = ""  # of the human drivers
     preset: str = Preset.UNGUARDED
-    keep: int = 0  # decisions that an action drawn from the preferences is kept; 0: epsilon-greedy
+    keep: int = 0  # decisions that an action drawn from the preferences is repeated; 0: epsilon-greedy
 
 
-class Drove(NamedTuple):
-    """What came of it."""
+class DriveResult(NamedTuple):
+    """The result of one driven episode."""
 
     trajectories: list[Trajectory]
     figures: dict[str, float | None]  # crashed, mission_success, dt_..., reward (a decision and AV), steps
@@ -146,13 +146,13 @@ def drives(c: VfnTraining, k: int, weights: str, frozen: str, epsilon: float, ke
     return drawn
 
 
-def judged(c: VfnTraining, k: int) -> bool:
+def is_validated(c: VfnTraining, k: int) -> bool:
     """Whether the weights that iteration `k` begins with are validated."""
     return (k % c.validate_every == 0 and k > 0) or k + 1 == c.iterations
 
 
 def validation(c: VfnTraining, weights: str) -> list[Drive]:
-    """Every lesson in turn, greedy, on tuning seeds."""
+    """Every lesson in turn, greedy, on validation seeds."""
     svo = math.radians(c.svo[len(c.svo) // 2])
     return [
         Drive(

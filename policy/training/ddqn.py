@@ -18,8 +18,8 @@ class DdqnConfig:
 
     learning_rate: float = 5e-4
     target_every: int = 300  # updates between copies of the online network
-    r_unsafe: float = -5.0  # of a preferred action that the prioritizer refused: a crash's (Alg. 4, line 13)
-    scale: float = 0.1  # of all rewards: action values of the order of 1
+    r_unsafe: float = -5.0  # reward of a refused preferred action, as of a crash (Alg. 4, line 13)
+    scale: float = 0.1  # factor on all rewards, for action values of the order of 1
     refused: float = 1.0  # weight of the refused actions' loss
     clip: float = 10.0  # largest gradient norm
 
@@ -39,8 +39,8 @@ class DdqnLearner(Learner):
         self._networks["target"] = self.target
 
     def update(self, batch: Batch) -> Metrics:
-        """One step of double Q-learning with masked targets (P, equations 2 and 3; algorithm 4); each part of
-        the values learns from its own part of the return.
+        """One step of double Q-learning with masked targets (P, equations 2 and 3; algorithm 4). Each part of
+        the values is trained on its part of the return.
 
         Returns `td` (Huber loss of the n-step error), `unsafe` (loss of the refused actions) and `q` (mean
         value of the actions carried out).
@@ -48,10 +48,10 @@ class DdqnLearner(Learner):
         c = self.config
         with torch.no_grad():
             best = self.online(*batch.later).masked_fill(~batch.allowed, -torch.inf).argmax(1)
-            later = _taken(self.target.apart(*batch.later), best)
+            later = _taken(self.target.part_values(*batch.later), best)
             gained = batch.reward[:, None] if self.online.config.parts == 1 else batch.parts
             goal = gained * c.scale + batch.discount[:, None] * later
-        apart = self.online.apart(*batch.now)
+        apart = self.online.part_values(*batch.now)
         td = functional.smooth_l1_loss(_taken(apart, batch.action), goal)
         q = self.online.weighed(apart, batch.now.phi)
         unsafe = self._refused(q, batch)
@@ -63,11 +63,11 @@ class DdqnLearner(Learner):
         return {name: float(value.detach()) for name, value in losses.items()}
 
     def effects(self, batch: Batch, past: int) -> Metrics:
-        """Shares of the batch in which another choice comes out on top when one input is another sample's.
+        """Shares of the batch with another best action after one input is replaced by another sample's.
 
         Args:
             batch: any samples.
-            past: N, the frames of maps and kinematics that were perceived; those behind are predicted.
+            past: N, the perceived frames of maps and kinematics; later frames are predicted.
         """
         now, found = batch.now, {}
         parts = {
@@ -88,11 +88,11 @@ class DdqnLearner(Learner):
         return found
 
     def update_target(self) -> None:
-        """The target network becomes the online one."""
+        """Copy the online network into the target network."""
         self.target.load_state_dict(self.online.state_dict())
 
     def _refused(self, q: torch.Tensor, batch: Batch) -> torch.Tensor:
-        """Loss of the preferred actions that the prioritizer refused: each is worth `r_unsafe` (Alg. 4)."""
+        """Loss of preferred actions that the prioritizer refused: their target is `r_unsafe` (Alg. 4)."""
         c = self.config
         refused = batch.vetoed >= 0
         value = q[refused].gather(1, batch.vetoed[refused][:, None])[:, 0]
@@ -101,5 +101,5 @@ class DdqnLearner(Learner):
 
 
 def _taken(apart: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-    """[B,parts] of the values [B,parts,A]: those of each action [B]."""
+    """[B,parts] values of the actions [B], from [B,parts,A]."""
     return apart.gather(2, action[:, None, None].expand(-1, apart.shape[1], 1))[..., 0]

@@ -1,4 +1,4 @@
-"""One AV's trajectory of one episode, as learners store it: every frame once, no stack twice."""
+"""One AV's trajectory of one episode in the replay buffer: every frame is stored once."""
 
 import zipfile
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from cosim.files import whole
 from cosim.types import Bools, Bytes, Floats32
 from policy.inputs.tensors import States
 
-Ending = Literal["crashed", "left", "cut"]  # cut: the episode ended before the AV's drive did
+Ending = Literal["crashed", "left", "cut"]  # cut: the episode ended with the AV on the road
 Halves = npt.NDArray[np.float16]
 
 
@@ -23,23 +23,23 @@ class Trajectory:
     """D decisions of one AV and the D + 1 states around them.
 
     The past frames of state t are `frames[t * stride : t * stride + N]`: consecutive histories share all
-    but `stride` frames. Only the last state of a `crashed` trajectory has no value of its own.
+    but `stride` frames. Only the last state of a `crashed` trajectory is terminal.
     """
 
-    episode: str  # scenario, demand and seed, to find it again
+    episode: str  # scenario, demand and seed
     av: str
     stride: int  # frames per decision
-    # maps [.,C,H,W], pixel * 255; of a network with an encoder their latents [.,L]
+    # maps [.,C,H,W], pixel * 255; with an encoder their latents [.,L]
     frames: Bytes | Halves  # [N + D * stride, ...]
     ahead: Bytes | Halves  # [D+1, M, ...] of predicted maps
     kinematics: Halves  # [D+1, T,R,F+1] scaled (policy.inputs.tensors)
     situation: Floats32  # [D+1, .]
-    unsafe: Bools  # [D+1, A] what the prioritizer masked
+    unsafe: Bools  # [D+1, A] actions masked by the prioritizer
     action: npt.NDArray[np.int8]  # [D] carried out
-    vetoed: npt.NDArray[np.int8]  # [D] the preferred action that was masked, or -1
+    vetoed: npt.NDArray[np.int8]  # [D] preferred action if masked, else -1
     terms: Floats32  # [D,3] reward terms: ego, AVs, HVs (equation 6)
-    interacting: Bools  # [D] near a mission vehicle, or vetoed: drawn more often
-    phi: float  # rad, the SVO it acted with
+    interacting: Bools  # [D] near a mission vehicle, or vetoed: sampled more often
+    phi: float  # rad, the SVO of the episode
     ending: Ending
 
     def __len__(self) -> int:
@@ -61,7 +61,7 @@ def states(chosen: list[tuple[Trajectory, int]], phi: Floats32, device: str = "c
 
     Args:
         chosen: B pairs (trajectory, t).
-        phi: [B] rad, the SVO to act with.
+        phi: [B] rad, the SVO.
         device: of torch.
     """
     first = chosen[0][0]
@@ -79,9 +79,9 @@ def states(chosen: list[tuple[Trajectory, int]], phi: Floats32, device: str = "c
 
 
 def save(path: Path, trajectories: list[Trajectory]) -> None:
-    """Write trajectories to one compressed .npz, whole or not at all: nothing in it is ever unpickled."""
+    """Write trajectories atomically to one compressed .npz, without pickled objects."""
     arrays = {f"{k}.{name}": value for k, one in enumerate(trajectories) for name, value in vars(one).items()}
-    # mostly zeros: level 1 will do
+    # mostly zeros: level 1 suffices
     deflated = partial(zipfile.ZipFile, compression=zipfile.ZIP_DEFLATED, compresslevel=1)
     with whole(path) as draft, deflated(draft, "w") as file:
         for name, value in {"count": len(trajectories), **arrays}.items():
@@ -90,7 +90,7 @@ def save(path: Path, trajectories: list[Trajectory]) -> None:
 
 
 def load(path: Path) -> list[Trajectory]:
-    """What `save` wrote."""
+    """The trajectories that `save` wrote."""
     with np.load(path, allow_pickle=False) as file:
         return [
             Trajectory(

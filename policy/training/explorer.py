@@ -1,4 +1,4 @@
-"""The agent while it learns: explores, and records the trajectories of its learning AVs."""
+"""The agent in training: exploration, and recording of the learning AVs' trajectories."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -17,18 +17,18 @@ from policy.inputs.tensors import States, to_numpy
 from policy.networks.vfn import VFN
 from policy.training.experience import Ending, Trajectory
 
-STATE = ("ahead", "kinematics", "situation", "unsafe")  # fields of `Trajectory` with one value more
+STATE_FIELDS = ("ahead", "kinematics", "situation", "unsafe")  # fields of `Trajectory` with D + 1 values
 
 
-NEAR = 60.0  # m to the mission vehicle within which a decision counts as interaction
+INTERACTION_RADIUS = 60.0  # m, distance to the mission vehicle that makes a decision an interaction
 
 
 @dataclass(frozen=True, slots=True)
 class ExploreConfig:
-    """Who learns in an episode, and how it explores."""
+    """Number of learning AVs per episode and their exploration."""
 
     learners: int = 4  # AVs that explore and are recorded; the others act with frozen weights (P, Alg. 4)
-    repeat: float = 2.0  # decisions a random action is kept on average: a gap does not open in 0.4 s
+    repeat: float = 2.0  # mean decisions that a random action is repeated: a gap does not open in 0.4 s
 
     def __post_init__(self) -> None:
         """Raises BadInput for a number out of range."""
@@ -38,8 +38,8 @@ class ExploreConfig:
 class Explorer(PredictionAware):
     """`PredictionAware` whose first few AVs explore with the learner's weights.
 
-    The others act greedily with `frozen` ones, so that one AV's transitions do not depend on what its
-    neighbours explore (semi-sequential training, P algorithm 4; T, section IV). `episode` must be called
+    The others act greedily with `frozen` weights, so that one AV's transitions do not depend on its
+    neighbours' exploration (semi-sequential training, P algorithm 4; T, section IV). `episode` must be called
     after `reset`.
     """
 
@@ -52,25 +52,25 @@ class Explorer(PredictionAware):
     def episode(
         self, label: str, epsilon: float, rng: np.random.Generator, record: bool = True, keep: int = 0
     ) -> None:
-        """A new episode.
+        """Start an episode.
 
         Args:
-            label: scenario, demand and seed, to find the trajectories again.
-            epsilon: how much exploration, 0 to 1.
-            rng: what is tried, and by which AVs, is drawn from it.
-            record: False: no AV learns, all drive greedily by the frozen network.
-            keep: decisions that an action drawn from the preferences is kept; 0: epsilon-greedy.
+            label: scenario, demand and seed of the trajectories.
+            epsilon: share of exploration, 0 to 1.
+            rng: source of the explored actions and of the learning AVs.
+            record: False: no AV learns, all drive greedily with the frozen network.
+            keep: decisions that an action drawn from the preferences is repeated; 0: epsilon-greedy.
         """
         self._label, self._epsilon, self._rng, self._keep = label, epsilon, rng, keep
         self._learners = self.explore.learners if record else 0
         self.learning: dict[str, dict[str, list[Any]]] = {}  # AV -> field of `Trajectory` -> values so far
-        self._repeated: dict[str, int] = {}  # random action that an AV keeps for a while
-        # AV -> an action that was drawn, and for how many decisions more
+        self._repeated: dict[str, int] = {}  # AV -> repeated random action
+        # AV -> drawn action, and decisions left
         self._held: dict[str, tuple[MetaAction, int]] = {}
         self.done: list[Trajectory] = []
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
-        """As the agent's, with exploration; the states of learning AVs are recorded."""
+        """The agent's decisions with exploration; the states of learning AVs are recorded."""
         if not histories:
             return {}
         inputs = self.perceive(histories)
@@ -84,10 +84,10 @@ class Explorer(PredictionAware):
         return decisions
 
     def perceive(self, histories: Mapping[str, History]) -> Inputs:
-        """As the agent's; of an encoder, which both networks have, the latents in place of the maps."""
+        """See `PredictionAware.perceive`; with an encoder, shared by both networks, latents replace maps."""
         inputs = self.encoded(super().perceive(histories))
         maps = inputs.states.maps
-        if maps.is_floating_point():  # as they are kept
+        if maps.is_floating_point():  # same precision as in the replay buffer
             maps = maps.to(torch.float16)
         return inputs._replace(states=inputs.states._replace(maps=maps))
 
@@ -109,11 +109,11 @@ class Explorer(PredictionAware):
             t = terms[av]
             self.learning[av]["terms"].append(np.array((t.ego, t.av_social, t.hv_social), np.float32))
             if av in crashed or av not in present:
-                # the state after the last decision was never seen: the one before stands in, unused
+                # the state after the last decision was never observed: the one before is a placeholder
                 self._close(av, "crashed" if av in crashed else "left", again=True)
 
     def finish(self) -> list[Trajectory]:
-        """The trajectories of an episode that is over; those still open are cut at the last state."""
+        """The trajectories of a finished episode; open trajectories are cut at the last state."""
         for av in list(self.learning):
             self._close(av, "cut", again=False)
         return self.done
@@ -121,7 +121,7 @@ class Explorer(PredictionAware):
     # ---- inside ----
 
     def _choose_learners(self, inputs: Inputs) -> None:
-        """Those who see a mission vehicle first, then any."""
+        """AVs that perceive a mission vehicle first, then any."""
         scene = inputs.scene
         sees = [bool((h.kinematics[-1, :, IS_MISSION] * h.valid[-1] > 0.5).any()) for h in scene.histories]
         draws = self._rng.random(len(scene.agents))
@@ -130,7 +130,7 @@ class Explorer(PredictionAware):
         self._learners = 0
 
     def _explored(self, q: Floats32, agents: Sequence[str]) -> Floats32:
-        """Random preferences in place of some learning AVs' values; the prioritizer still guards them."""
+        """Random preferences in place of some learning AVs' values; the prioritizer still applies."""
         q = q.copy()
         if self._keep:
             self._draw(q, agents)
@@ -141,7 +141,7 @@ class Explorer(PredictionAware):
             draws = self._rng.random(2)
             if av in self._repeated and draws[0] < 1.0 / self.explore.repeat:
                 del self._repeated[av]
-            # started so often that a share epsilon of the decisions is random
+            # start rate for a share epsilon of random decisions
             start = self._epsilon / max(self.explore.repeat - self._epsilon * (self.explore.repeat - 1), 1.0)
             if av not in self._repeated and draws[1] < start:
                 self._repeated[av] = int(self._rng.integers(len(MetaAction)))
@@ -151,7 +151,7 @@ class Explorer(PredictionAware):
         return q
 
     def _draw(self, q: Floats32, agents: Sequence[str]) -> None:
-        """Learning AVs' preferences q [B,A], replaced by such that the drawn action is preferred."""
+        """Preferences q [B,A] of learning AVs, changed so that the drawn action is preferred."""
         mine = [b for b, av in enumerate(agents) if av in self.learning]
         # the largest of log-preferences + Gumbel noise is a draw from their softmax
         noise = self._rng.gumbel(size=(len(mine), q.shape[1])).astype(np.float32)
@@ -162,7 +162,7 @@ class Explorer(PredictionAware):
                     self._held[agents[b]] = MetaAction(int(q[b].argmax())), self._keep - 1
 
     def _holds(self, av: str, q: Floats32) -> bool:
-        """Whether an action is set for this decision; then q [A] prefers it."""
+        """Whether an action is fixed for this decision; then q [A] is set to prefer it."""
         action, more = self._held.pop(av, (None, 0))
         if action is None:
             return False
@@ -180,7 +180,7 @@ class Explorer(PredictionAware):
         preferred = int(np.argmax(decision.q))
         newest, maps, past = history.kinematics[-1], states.maps[b].numpy(), self.observation.frames
         mission = history.valid[-1] & (newest[:, IS_MISSION] > 0.5)
-        close = mission & (np.hypot(newest[:, 0], newest[:, 1]) < NEAR)
+        close = mission & (np.hypot(newest[:, 0], newest[:, 1]) < INTERACTION_RADIUS)
         now = {
             "frames": maps[past - self._stride if recorded["frames"] else 0 : past].copy(),
             "ahead": maps[past:].copy(),
@@ -207,11 +207,11 @@ class Explorer(PredictionAware):
             return
         if again:
             recorded["frames"].append(recorded["frames"][-1][-self._stride :])
-            for name in STATE:
+            for name in STATE_FIELDS:
                 recorded[name].append(recorded[name][-1])
         frames = np.concatenate(recorded.pop("frames"))[: self.observation.frames + count * self._stride]
         arrays: dict[str, Any] = {
-            name: np.stack(values[: count + (name in STATE)]) for name, values in recorded.items()
+            name: np.stack(values[: count + (name in STATE_FIELDS)]) for name, values in recorded.items()
         }
         self.done.append(
             Trajectory(

@@ -1,4 +1,4 @@
-"""The three HPNs that are trained and compared, and how: the shipped one, and two ablations of it."""
+"""Training of the three compared HPNs: the shipped one, and two ablations of it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,11 +22,11 @@ VARIANTS: dict[str, HpnConfig] = {
 
 @dataclass(frozen=True, slots=True)
 class HpnTraining:
-    """One training run. Defaults: what trains on a CPU core in an hour."""
+    """One training run. Defaults: one hour on a CPU core."""
 
-    stride: int = 4  # decisions between two moments of an episode: neighbours are nearly the same
+    stride: int = 4  # decisions between two samples of an episode: consecutive ones are nearly equal
     updates: int = 6000
-    batch: int = 16  # moments an update: about 600 vehicles
+    batch: int = 16  # moments per update: about 600 vehicles
 
     @property
     def map_stride(self) -> int:
@@ -34,7 +34,7 @@ class HpnTraining:
         return 5 * self.stride
 
     def loop(self, variant: HpnConfig) -> LoopConfig:
-        """How long a variant is trained; an update of `hpn-plain` costs four times as much."""
+        """The training length of a variant; an update of `hpn-plain` costs four times as much."""
         return LoopConfig.of(-(-self.updates // 3) if variant.maps == "plain" else self.updates)
 
 
@@ -56,7 +56,7 @@ def make_task(
 
 
 def assemble(name: str, task: KinematicTask | MapTask) -> HPN:
-    """The whole HPN around what was trained."""
+    """The complete HPN with the trained branch."""
     network = HPN(VARIANTS[name])
     branch = network.kinematic if isinstance(task, KinematicTask) else network.map_branch
     assert branch is not None
@@ -71,7 +71,7 @@ def save(path: Path, name: str, network: HPN, last: Line, data: Mapping[str, Any
 
 
 def load(path: Path) -> tuple[str, HPN]:
-    """A trained HPN and which variant it is. Raises BadInput, WeightsMismatch."""
+    """The variant's name and the trained HPN. Raises BadInput, WeightsMismatch."""
     card = checkpoint.read_card(path)
     name = str(card["measured"].get("variant"))
     if name not in VARIANTS:

@@ -1,9 +1,9 @@
-"""Trains the HPN's kinematic branch on recorded episodes: the right place in the picture, and how sure.
+"""Training of the HPN's kinematic branch on recorded episodes: position in the picture, and confidence.
 
-The maps are drawn from the corrected kinematics, so what counts is where a vehicle lies in the picture of
-an AV that moves itself: the loss is taken between pairs (AV, vehicle), in the AV's own predicted frame, for
-all frames of the horizon at once. It saturates when a box misses altogether: half a car's length off is worse
-than nothing, ten metres off are as wrong as twenty.
+Maps are drawn from the corrected kinematics, so the relevant error is a vehicle's position in the picture of
+a moving AV. The loss is taken over pairs (AV, vehicle), in the AV's own predicted frame, for all frames of
+the horizon at once. It saturates without overlap of the boxes: an error of ten metres is as wrong as twenty.
+An error of half a car's length is already worse than no drawing.
 """
 
 from collections.abc import Sequence
@@ -15,34 +15,34 @@ import numpy as np
 import torch
 
 from cosim.types import Bools, Floats32
-from policy.networks.kinematic_branch import KinematicBranch, KinematicConfig, correct, sureness
+from policy.networks.kinematic_branch import KinematicBranch, KinematicConfig, confidence, correct
 from policy.networks.seeded import first_weights
 from policy.training.loop import Task, drawn, one_cycle
 from policy.training.moments import Moment
 
 HALF_LENGTH, HALF_WIDTH = 2.5, 1.0  # m, half a car: an error of that size loses half of the box
-WINDOW = (128.0, 16.0)  # m, what lies outside of both pictures counts for nothing
-REACH = (160.0, 30.0)  # m, now: of those further off one in 150 comes into the window within the horizon
+PICTURE_WINDOW = (128.0, 16.0)  # m, vehicles outside of both pictures have weight 0
+PAIR_REACH = (160.0, 30.0)  # m, present; beyond it one vehicle in 150 enters the window within the horizon
 
 
 @dataclass(frozen=True, slots=True)
 class KinematicTraining:
-    """How it is trained. Chosen on validation seeds."""
+    """Options of the training, chosen on validation seeds."""
 
-    batch: int = 16  # moments an update: about 600 vehicles
+    batch: int = 16  # moments per update: about 600 vehicles
     rate: float = 2e-3  # AdamW, one cycle
     decay: float = 1e-3
     clip: float = 1.0  # norm of the gradient
-    far: float = 0.3  # weight of the part that does not saturate: it shows the way from far off
-    alone: float = 0.3  # weight of each vehicle's own place, beside its place in the pictures
+    far: float = 0.3  # weight of the unsaturated part, for a gradient far from the truth
+    alone: float = 0.3  # weight of each vehicle's own position error, beside that in the pictures
     speed: float = 0.1  # per 3 m/s
     heading: float = 0.2  # per rad
-    early: float = 0.15  # of the horizon: frames weigh 1 / (early + t), or the first ones would not count
+    early: float = 0.15  # share of the horizon: frames weigh 1 / (early + t), so that early frames count
     seed: int = 0
 
 
 class Batch(NamedTuple):
-    """Moments one behind the other, and the pairs among them."""
+    """Concatenated moments, and the pairs among them."""
 
     own: torch.Tensor
     near: torch.Tensor
@@ -54,7 +54,7 @@ class Batch(NamedTuple):
 
 
 def collate(moments: Sequence[Moment], device: str = "cpu") -> Batch:
-    """One batch; vehicles that are not known are left out."""
+    """One batch; unknown vehicles are left out."""
     first = 0
     looking, seen = [], []
     for m in moments:
@@ -73,10 +73,10 @@ def collate(moments: Sequence[Moment], device: str = "cpu") -> Batch:
 
 
 def _near(egos: Floats32, others: Floats32) -> Bools:
-    """[E,V] who is within REACH of which AV; states [.,4] x y speed heading."""
+    """[E,V] whether vehicle V is within PAIR_REACH of AV E; states [.,4] x y speed heading."""
     dx, dy = (others[None, :, k] - egos[:, None, k] for k in (0, 1))
     c, s = np.cos(egos[:, 3:4]), np.sin(egos[:, 3:4])
-    found: Bools = (np.abs(c * dx + s * dy) < REACH[0]) & (np.abs(c * dy - s * dx) < REACH[1])
+    found: Bools = (np.abs(c * dx + s * dy) < PAIR_REACH[0]) & (np.abs(c * dy - s * dx) < PAIR_REACH[1])
     return found
 
 
@@ -102,7 +102,7 @@ def losses(raw: torch.Tensor, batch: Batch, c: KinematicTraining) -> dict[str, t
         1 - across.abs() / (2 * HALF_WIDTH)
     ).clamp_min(0)
     share = torch.where(there[v], share.detach(), 0.0)
-    sure = sureness(raw[v][..., 5], raw[e][..., 6])
+    sure = confidence(raw[v][..., 5], raw[e][..., 6])
     doubt = _mean((sure - share) ** 2, (shown & there[e]) * frames)
     total = picture + c.alone * alone + c.speed * speed + c.heading * heading + doubt
     missed = _mean(1.0 - share, both)
@@ -119,7 +119,7 @@ def _seen_from(states: torch.Tensor, ego: torch.Tensor) -> torch.Tensor:
 
 
 def _inside(place: torch.Tensor) -> torch.Tensor:
-    return (place[..., 0].abs() < WINDOW[0]) & (place[..., 1].abs() < WINDOW[1])
+    return (place[..., 0].abs() < PICTURE_WINDOW[0]) & (place[..., 1].abs() < PICTURE_WINDOW[1])
 
 
 def _misplaced(along: torch.Tensor, across: torch.Tensor, far: float) -> torch.Tensor:
@@ -137,7 +137,7 @@ class KinematicTask(Task):
     Args:
         config: layout of the branch.
         training: batch size, learning rate, weights of the losses, seed.
-        updates: how many there will be; the learning rate's cycle ends with the last.
+        updates: total number; the learning rate's cycle ends with the last.
         train, validation: examples (`policy.training.moments.moment`).
         device: of torch.
     """

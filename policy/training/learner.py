@@ -1,4 +1,4 @@
-"""What both ways of learning have: a value network and its optimiser."""
+"""The common base of both learners: a value network and its optimiser."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -27,7 +27,7 @@ class Learner(Optimized):
         self.config, self.device = config, device
         self.online: VFN = seeded(lambda: VFN(vfn), seed)
         self.online.to(device=device, memory_format=self.online.layout)  # type: ignore[call-overload]
-        learning = [p for p in self.online.parameters() if p.requires_grad]  # an encoder does not
+        learning = [p for p in self.online.parameters() if p.requires_grad]  # an encoder is frozen
         adam = torch.optim.Adam(learning, lr=config.learning_rate)
         super().__init__({"online": self.online}, adam, config.clip)
         self.updates = 0

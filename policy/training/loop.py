@@ -1,9 +1,9 @@
-"""The loop of every supervised training: updates, logs, checkpoints, and going on after a kill.
+"""The loop of every supervised training: updates, logs, checkpoints and resumption after a kill.
 
-A run is a folder: `state.safetensors` (weights, optimiser, counters and the log so far, replaced as a whole,
-so that a kill leaves either the old state or the new one), `log.csv` and TensorBoard's event files. Batches
-and learning rates follow from (seed, update), never from a generator that would have to be remembered: a run
-that goes on after `kill -9` sees the very batches that the uninterrupted one sees.
+A run is a folder with `state.safetensors` (weights, optimiser, counters and the log so far), `log.csv` and
+TensorBoard's event files. The state is replaced atomically, so a kill leaves either the old or the new one.
+Batches and learning rates follow from (seed, update), not from a stateful generator: a run resumed after
+`kill -9` sees the same batches as an uninterrupted run.
 """
 
 import csv
@@ -25,35 +25,35 @@ from cosim.files import whole
 from cosim.seeding import generator
 from policy.training.networks import Optimized
 
-Progress = Callable[[float, float], None]  # updates so far, of updates in all
+Progress = Callable[[float, float], None]  # updates so far, total updates
 Line = dict[str, float]
 Example = TypeVar("Example")
 
 
 @dataclass(frozen=True, slots=True)
 class LoopConfig:
-    """How long and how often."""
+    """Length of the training and intervals of its outputs."""
 
     updates: int = 8000
     log_every: int = 100  # updates a line of the log averages over
     validate_every: int = 500  # updates
-    save_every: float = 30.0  # s between checkpoints: what a kill may cost
+    save_every: float = 30.0  # s between checkpoints
 
     @classmethod
     def of(cls, updates: int) -> "LoopConfig":
-        """So many updates: 40 lines of the log, 8 validations."""
+        """`updates` updates: 40 lines of the log, 8 validations."""
         return cls(updates, math.ceil(updates / 40), math.ceil(updates / 8))
 
 
 class Task(Optimized):
-    """One network that learns from examples; a kind of training says what its batches and losses are.
+    """Training of one network on examples; subclasses define batches and losses.
 
     Args:
-        network: what is trained.
+        network: the trained network.
         optimizer: of its parameters.
         schedule: update number, from 0 -> learning rate.
         validation: batches as `losses` takes them, and the weight of each in the mean.
-        clip: largest norm of the gradient; None: as it is.
+        clip: largest norm of the gradient; None: unlimited.
     """
 
     def __init__(
@@ -68,11 +68,11 @@ class Task(Optimized):
         self._schedule, self._validation = schedule, validation
 
     def batch(self, number: int) -> Any:
-        """The batch of update `number`; it depends on that and the seed alone."""
+        """The batch of update `number`; a function of `number` and the seed."""
         raise NotImplementedError
 
     def losses(self, batch: Any) -> dict[str, torch.Tensor]:
-        """Scalars by name; `loss` is what is minimised."""
+        """Scalars by name; `loss` is minimised."""
         raise NotImplementedError
 
     def update(self, number: int) -> Line:
@@ -106,9 +106,9 @@ def train(
     resume: bool = False,
     progress: Progress | None = None,
 ) -> list[Line]:
-    """Train to the end; the whole log. `layout`: what the run is; a resumed one must be the same.
+    """Train to the end; returns the log. `layout` describes the run and must be equal on resumption.
 
-    Raises BadInput when the folder holds a run already (and `resume` is not given), or another one.
+    Raises BadInput when the folder holds a run already (without `resume`), or another run.
     """
     state_file = folder / "state.safetensors"
     wanted = json.loads(json.dumps(layout))
@@ -159,14 +159,14 @@ def train(
 
 
 def tensorboard(folder: Path, begin: int | None = None) -> Any:
-    """A writer of scalars into `folder`/tensorboard; what it holds from step `begin` on is superseded."""
+    """A writer of scalars into `folder`/tensorboard; existing records from step `begin` on are superseded."""
     from torch.utils.tensorboard import SummaryWriter
 
     return SummaryWriter(str(folder / "tensorboard"), purge_step=begin)
 
 
 def one_cycle(number: int, updates: int, rate: float) -> float:
-    """Learning rate of an update: up to `rate` over the first three tenths, then down to nothing (cosine)."""
+    """Learning rate of an update: up to `rate` over the first three tenths, then down to 0 (cosine)."""
     warm = 0.3 * updates
     if number < warm:
         return rate * (0.04 + 0.96 * 0.5 * (1.0 - math.cos(math.pi * number / warm)))
@@ -174,7 +174,7 @@ def one_cycle(number: int, updates: int, rate: float) -> float:
 
 
 def write_log(path: Path, log: Sequence[Line]) -> None:
-    """The log as CSV: a column per loss, empty where it was not taken."""
+    """The log as CSV: a column per loss, empty where not measured."""
     names = list(dict.fromkeys(name for line in log for name in line))
     with whole(path) as draft, draft.open("w", newline="") as file:
         rows = csv.DictWriter(file, names, restval="")

@@ -1,4 +1,4 @@
-"""Trains the HPN's map branch as P does: from true histories, the next block of maps and kinematics."""
+"""Training of the HPN's map branch after P: from true histories to the next block of maps and kinematics."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from policy.training.moments import MapSample
 
 @dataclass(frozen=True, slots=True)
 class MapTraining:
-    """How it is trained."""
+    """Options of the training."""
 
     batch: int = 16  # AVs
     rate: float = 5e-4  # P, Table I
@@ -31,7 +31,7 @@ class MapTask(Task):
     Args:
         config: layout of the branch.
         training: batch size, learning rate, weights of the losses, seed.
-        updates: how many there will be; the learning rate's cycle ends with the last.
+        updates: total number; the learning rate's cycle ends with the last.
         train, validation: examples (`policy.training.moments.map_sample`).
         device: of torch.
     """

@@ -1,4 +1,4 @@
-"""Networks with their optimiser: steps, and a state of named tensors (nothing is ever pickled)."""
+"""Networks with their optimiser: steps, and a state of named tensors (without pickle)."""
 
 from collections.abc import Mapping
 
@@ -7,12 +7,12 @@ from torch import nn
 
 
 class Optimized:
-    """Networks and the optimiser that changes them; `tensors` and `restore` carry both over a kill.
+    """Networks and their optimiser; `tensors` and `restore` save and load both.
 
     Args:
         networks: name -> module; the names are prefixes in the saved state.
         optimizer: of the parameters that are trained.
-        clip: largest norm of the gradient; None: as it is.
+        clip: largest norm of the gradient; None: unlimited.
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class Optimized:
         return {name: value.detach().to("cpu").contiguous().clone() for name, value in out.items()}
 
     def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
-        """Back to the state that `tensors` gave."""
+        """Restore the state returned by `tensors`."""
         for name, network in self._networks.items():
             network.load_state_dict(
                 {k.removeprefix(f"{name}."): v for k, v in tensors.items() if k.startswith(f"{name}.")}
@@ -53,7 +53,7 @@ class Optimized:
 
 
 def usable(device: str) -> bool:
-    """Whether torch can put a tensor on `device`."""
+    """Whether torch can allocate a tensor on `device`."""
     try:
         torch.empty(1, device=device)
     except (RuntimeError, AssertionError):  # AssertionError: torch built without CUDA
@@ -62,5 +62,5 @@ def usable(device: str) -> bool:
 
 
 def use_threads(count: int) -> None:
-    """Threads of this process for torch: a learner beside actors wants one each."""
+    """Set torch's threads in this process: a learner beside actors should use one each."""
     torch.set_num_threads(count)

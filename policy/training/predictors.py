@@ -1,7 +1,7 @@
-"""Fits the kinematic predictors: the prior over kernels, its calibration, and P's learned baselines.
+"""Fits of the kinematic predictors: the prior over kernels, its calibration, and P's learned baselines.
 
-All of them see the same windows of recorded episodes and minimise the same figure, the mean position error
-over the horizon (PE), so that their table compares methods and not objectives.
+All use the same windows of recorded episodes and minimise the mean position error over the horizon (PE), so
+that their table compares methods, not objectives.
 """
 
 import math
@@ -25,25 +25,25 @@ from policy.training.loop import Line, LoopConfig, Progress, Task, train
 
 Batch = Mapping[str, torch.Tensor]  # name -> [S,...], S the same for all
 Loss = Callable[[Batch], torch.Tensor]
-CHECKED = 8192  # validation examples a loss is taken on, about
-COVERED = 0.9  # what an interval shall cover
-NORMAL = 1.645  # half its width in standard deviations, if errors were normal
-SPREAD_WEIGHT = 0.05  # of the intervals' loss: it shall not move the mean forecast
-SPREAD = slice(None, None, 4)  # of a batch: intervals cost more than the mean and need less
+VALIDATION_EXAMPLES = 8192  # approximate number of validation examples per loss
+COVERAGE = 0.9  # nominal coverage of an interval
+COVERAGE_DEVIATIONS = 1.645  # half of its width in standard deviations, for normal errors
+SPREAD_WEIGHT = 0.05  # of the intervals' loss, small enough not to move the mean forecast
+SPREAD_SAMPLES = slice(None, None, 4)  # part of a batch: intervals cost more than the mean and need less data
 
 GaussianProcess = type[GaussianProcessIndirect] | type[GaussianProcessDirect]
 
 
 class Windows(NamedTuple):
-    """S moments of single vehicles with their whole past known, each in its own frame at that moment."""
+    """S moments of single vehicles with a completely known past, each in its own frame at that moment."""
 
     past: Floats  # [S,N,4] x m ahead, y m left, speed m/s, heading rad
-    future: Floats  # [S,M,4] nan once it has left
+    future: Floats  # [S,M,4] nan after the vehicle left
     weight: Floats  # [S] mean 1
 
 
 def in_own_frame(past: Floats, future: Floats, weight: Floats) -> Windows:
-    """Windows [S,N,4], [S,M,4] in the world; those with an unknown past or no future at all are left out."""
+    """Windows from world coordinates [S,N,4], [S,M,4]; an unknown past or no future is left out."""
     whole = np.isfinite(past).all((1, 2)) & np.isfinite(future[:, 0]).all(1)
     past, future, weight = past[whole], future[whole], weight[whole]
     now = past[:, -1:]
@@ -57,7 +57,7 @@ def in_own_frame(past: Floats, future: Floats, weight: Floats) -> Windows:
 
 
 def examples_for_net(windows: Windows) -> dict[str, torch.Tensor]:
-    """What `net_loss` needs of each window."""
+    """The inputs of `net_loss` for each window."""
     return {
         "past": features(windows.past, np.ones(len(windows.past), np.bool_)),
         "speed": _tensor(windows.past[:, -1, 2]),
@@ -77,7 +77,7 @@ def net_loss(network: KinematicNet, batch: Batch) -> torch.Tensor:
 
 
 def position_error(x: torch.Tensor, y: torch.Tensor, batch: Batch) -> torch.Tensor:
-    """PE: distance between forecast and truth, mean over the frames that have one, then over vehicles."""
+    """PE: distance between forecast and truth, mean over known frames, then over vehicles."""
     here = batch["here"]
     squared = (x - batch["future"][:, :, 0]) ** 2 + (y - batch["future"][:, :, 1]) ** 2
     error = torch.sqrt(squared + 1e-6) * here  # differentiable at 0
@@ -108,17 +108,17 @@ class BankMath(nn.Module):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """past [S,n] relative to now in the unit, evidence, log_prior [S,K] -> mean [S,2M], deviation [.,2M].
 
-        The deviation is that of the examples SPREAD, and no gradient flows through it.
+        The deviation covers the examples SPREAD_SAMPLES; no gradient flows through it.
         """
         weight = torch.softmax(evidence / heat + log_prior, 1)
         seen = torch.cat([past, torch.ones_like(past[:, :1])], 1)  # [S,n+1]
         mean = (weight[:, :, None] * seen[:, None]).flatten(1) @ self.table
         mean = torch.cat([mean, mean @ self.integral], 1)
         with torch.no_grad():
-            few = weight[SPREAD]
-            means = (seen[SPREAD] @ self.both).view(-1, self.kernels, 2 * self.steps)
+            few = weight[SPREAD_SAMPLES]
+            means = (seen[SPREAD_SAMPLES] @ self.both).view(-1, self.kernels, 2 * self.steps)
             second = torch.bmm(few[:, None], means.square_())[:, 0] + few @ self.variance
-            deviation = torch.sqrt((second - mean[SPREAD] ** 2).clamp(min=0.0) + 1e-8)
+            deviation = torch.sqrt((second - mean[SPREAD_SAMPLES] ** 2).clamp(min=0.0) + 1e-8)
         return self.unit * mean, self.unit * deviation
 
 
@@ -131,7 +131,7 @@ class PriorFit:
         self._math = [BankMath(bank, self.network.config.frames) for bank in self.predictor.banks]
 
     def examples(self, windows: Windows) -> dict[str, torch.Tensor]:
-        """What `loss` needs of each window."""
+        """The inputs of `loss` for each window."""
         known = np.ones(len(windows.past), np.bool_)
         found = {
             "motion": _tensor(describe(windows.past, known, self.predictor.dt)),
@@ -148,15 +148,15 @@ class PriorFit:
         return found
 
     def fitted(self) -> GaussianProcessIndirect | GaussianProcessDirect:
-        """The predictor with the prior as it is now."""
+        """The predictor with the present prior."""
         return type(self.predictor)(weights=self.network)
 
     def calibrate(self, factors: Floats) -> None:
-        """Set the factors [N,spreads,M] on the standard deviations, by how many frames are known."""
+        """Set the factors [N,spreads,M] on the standard deviations, by number of known frames."""
         self.network.calibration.copy_(torch.from_numpy(factors))
 
     def loss(self, batch: Batch) -> torch.Tensor:
-        """Position error, and a little of how badly the intervals fit (pinball loss of their edge)."""
+        """Position error plus SPREAD_WEIGHT times the intervals' pinball loss."""
         raw = self.network(batch["motion"])
         kernels = self.network.config.kernels
         *priors, spread = torch.split(raw, [*kernels, self.network.config.spreads], 1)
@@ -180,28 +180,28 @@ class PriorFit:
             dx, dy = future[:, :, 0] - x, future[:, :, 1] - y
             c, s = torch.cos(h), torch.sin(h)
             errors = [v - future[:, :, 2], h - future[:, :, 3], c * dx + s * dy, c * dy - s * dx]
-            across = (torch.sqrt(x**2 + y**2 + 1e-6) / elapsed)[SPREAD].detach() * second[1][:, m:]
+            across = (torch.sqrt(x**2 + y**2 + 1e-6) / elapsed)[SPREAD_SAMPLES].detach() * second[1][:, m:]
             deviations = [first[1][:, :m], second[1][:, :m], first[1][:, m:], across]
         total = position_error(x, y, batch)
-        here, weight, spread = here[SPREAD], batch["weight"][SPREAD], spread[SPREAD]
+        here, weight, spread = here[SPREAD_SAMPLES], batch["weight"][SPREAD_SAMPLES], spread[SPREAD_SAMPLES]
         for k, (error, deviation) in enumerate(zip(errors, deviations, strict=True)):
             unit = (1.0, 0.05, 1.0, 0.5)[k] if len(errors) == 4 else (1.0, 0.5)[k]
-            edge = NORMAL * deviation * torch.exp(spread[:, k : k + 1])
-            beyond = (error[SPREAD].detach().abs() - edge) / unit
-            pinball = torch.maximum(COVERED * beyond, (COVERED - 1.0) * beyond) * here
+            edge = COVERAGE_DEVIATIONS * deviation * torch.exp(spread[:, k : k + 1])
+            beyond = (error[SPREAD_SAMPLES].detach().abs() - edge) / unit
+            pinball = torch.maximum(COVERAGE * beyond, (COVERAGE - 1.0) * beyond) * here
             total = total + SPREAD_WEIGHT * (pinball.sum(1) / here.sum(1) * weight).mean()
         return total
 
 
 def factors_for(forecast_std: tuple[Floats, ...], errors: tuple[Floats, ...], weight: Floats) -> Floats:
-    """[quantities,M] the factor on each standard deviation with which an interval of NORMAL deviations covers
-    COVERED of the errors [S,M] (nan where there is no truth)."""
+    """[quantities,M] factor on each standard deviation, so that an interval of COVERAGE_DEVIATIONS covers the
+    share COVERAGE of the errors [S,M] (nan without truth)."""
     factors = np.ones((len(errors), errors[0].shape[1]))
     for q, (error, std) in enumerate(zip(errors, forecast_std, strict=True)):
         for step in range(error.shape[1]):
-            ratio = np.abs(error[:, step]) / np.maximum(NORMAL * std[:, step], 1e-9)
+            ratio = np.abs(error[:, step]) / np.maximum(COVERAGE_DEVIATIONS * std[:, step], 1e-9)
             there = np.isfinite(ratio)
-            factors[q, step] = _quantile(ratio[there], weight[there], COVERED)
+            factors[q, step] = _quantile(ratio[there], weight[there], COVERAGE)
     return factors
 
 
@@ -226,7 +226,7 @@ def _tensor(values: Floats | Bools) -> torch.Tensor:
 
 @dataclass(frozen=True, slots=True)
 class FitConfig:
-    """One fit with Adam and a learning rate that falls along a cosine to 0."""
+    """One fit with Adam and a cosine schedule of the learning rate down to 0."""
 
     steps: int = 6000
     batch: int = 1024
@@ -241,7 +241,7 @@ class FitTask(Task):
         self, network: nn.Module, loss: Loss, config: FitConfig, examples: Batch, validation: Batch
     ) -> None:
         self._loss, self._config, self._examples = loss, config, examples
-        stride = max(len(next(iter(validation.values()))) // CHECKED, 1)
+        stride = max(len(next(iter(validation.values()))) // VALIDATION_EXAMPLES, 1)
         checked = {name: tensor[::stride] for name, tensor in validation.items()}
         adam = torch.optim.Adam(network.parameters(), config.learning_rate)
         super().__init__(network, adam, self._rate, [(checked, 1)])
@@ -272,7 +272,7 @@ def fit(
     folder: Path | None = None,
     progress: Progress | None = None,
 ) -> list[Line]:
-    """Fit `network` in place; returns the log of losses. A fit that left a state in `folder` goes on.
+    """Fit `network` in place; returns the log of losses. A state in `folder` is resumed.
 
     Raises BadInput when `folder` holds another fit.
     """

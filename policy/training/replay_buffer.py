@@ -15,15 +15,15 @@ from policy.training.experience import Trajectory, states
 
 @dataclass(frozen=True, slots=True)
 class ReplayConfig:
-    """What is kept and how it is drawn."""
+    """Capacity and sampling of the replay buffer."""
 
-    capacity: int = 30_000  # decisions; P's 8,000 (Table I) are 20 episodes of 4 learners. 0.1 MB each
+    capacity: int = 30_000  # decisions of 0.1 MB; P's 8,000 (Table I) are 20 episodes of 4 learners
     batch: int = 64  # P, Table I
-    n_step: int = 8  # one step did not learn altruism (docs/guides/training.md); 1 is the papers'
-    gamma: float = 0.97  # a decision of 0.4 s; P: 0.95
-    # share of a batch near a mission vehicle, or vetoed, however rare that is (P, Alg. 4: rebalanced)
+    n_step: int = 8  # with 1 (the papers) no altruism was learned (docs/guides/training.md)
+    gamma: float = 0.97  # per decision of 0.4 s; P: 0.95
+    # share of a batch near a mission vehicle, or vetoed, regardless of frequency (P, Alg. 4: rebalanced)
     interaction: float = 0.25
-    relabel: float = 0.5  # share of a batch that is learned for another SVO, 0 to 90 deg, than was driven
+    relabel: float = 0.5  # share of a batch relabelled with another SVO, 0 to 90 deg
 
     def __post_init__(self) -> None:
         """Raises BadInput for a number out of range."""
@@ -37,15 +37,15 @@ class Batch(NamedTuple):
     later: States
     action: torch.Tensor  # [B]
     reward: torch.Tensor  # [B] float32
-    discount: torch.Tensor  # [B] gamma^k of the state `later`; 0 when the AV crashed before it
-    possible: torch.Tensor  # [B,A] bool, actions that were safe in `now`
-    allowed: torch.Tensor  # [B,A] bool, actions that were safe in `later` (all, where none was)
+    discount: torch.Tensor  # [B] gamma^k of the state `later`; 0 after a crash
+    possible: torch.Tensor  # [B,A] bool, safe actions in `now`
+    allowed: torch.Tensor  # [B,A] bool, safe actions in `later` (all, if none was safe)
     vetoed: torch.Tensor  # [B] the action the prioritizer refused in `now`, or -1
-    parts: torch.Tensor  # [B,2] the same return's own part and the others', not weighed by phi
+    parts: torch.Tensor  # [B,2] the ego's and the others' part of the return, not weighted by phi
 
 
 class ReplayBuffer:
-    """Newest trajectories up to `capacity` decisions."""
+    """The newest trajectories, up to `capacity` decisions."""
 
     def __init__(self, config: ReplayConfig) -> None:
         self.config = config
@@ -54,7 +54,7 @@ class ReplayBuffer:
         self._index: list[Ints] | None = None  # [*,2] (trajectory, t): the interactions, then the rest
 
     def add(self, trajectories: list[Trajectory]) -> int:
-        """Store them; returns how many of the oldest were dropped."""
+        """Store trajectories; returns the number of dropped oldest ones."""
         self.trajectories.extend(t for t in trajectories if len(t))
         self.size += sum(map(len, trajectories))
         dropped = 0
@@ -95,7 +95,7 @@ class ReplayBuffer:
         return Batch(states(now, phi, device), states(later, phi, device), *tensors)
 
     def _picks(self, rng: np.random.Generator, count: int) -> list[tuple[Trajectory, int]]:
-        """`count` places (trajectory, t), with replacement, in the configured parts."""
+        """`count` pairs (trajectory, t), with replacement, in the configured shares."""
         if not self.size:
             raise ValueError("the replay buffer is empty")
         share = self.config.interaction

@@ -1,4 +1,4 @@
-"""The two trainers: DDQN learns off-policy from the replay buffer, A2C on-policy from the latest drives."""
+"""The two trainers: DDQN, off-policy from the replay buffer; A2C, on-policy from the latest trajectories."""
 
 from collections.abc import Sequence
 
@@ -7,7 +7,7 @@ from cosim.seeding import generator, subseed
 from policy.networks.extractors import EncodedMaps
 from policy.networks.vfn import VfnConfig
 from policy.training.a2c import A2cLearner
-from policy.training.curriculum import VfnTraining, exploration, judged
+from policy.training.curriculum import VfnTraining, exploration, is_validated
 from policy.training.ddqn import DdqnLearner
 from policy.training.experience import Trajectory
 from policy.training.learner import Learner, Metrics, mean_metrics
@@ -16,16 +16,16 @@ from policy.training.sight import encoder
 
 
 class Trainer:
-    """One learner and its replay buffer; `TrainingRun` asks it in every iteration `k`.
+    """One learner and its replay buffer; `TrainingRun` calls it in every iteration `k`.
 
     Args:
         config: the schedule.
-        learner: what is trained.
+        learner: DDQN or A2C.
         device: of torch.
     """
 
     stores = True  # whether the trajectories of an iteration join the replay buffer
-    keep = 0  # decisions that a drawn action is kept; 0: epsilon-greedy
+    keep = 0  # decisions that a drawn action is repeated; 0: epsilon-greedy
 
     def __init__(self, config: VfnTraining, learner: Learner, device: str) -> None:
         self.config, self.learner, self.device = config, learner, device
@@ -36,16 +36,16 @@ class Trainer:
         raise NotImplementedError
 
     def learn_meanwhile(self, k: int) -> Metrics:
-        """Learn what does not wait for this iteration's trajectories."""
+        """Updates that run in parallel with this iteration's episodes."""
         return {}
 
     def learn_afterwards(self, k: int, drives: Sequence[Trajectory]) -> Metrics:
-        """Learn from this iteration's trajectories."""
+        """Updates on this iteration's trajectories."""
         return {}
 
 
 class OffPolicyTrainer(Trainer):
-    """P, algorithm 4: fill the replay buffer by chance, then so many updates an iteration."""
+    """P, algorithm 4: fill the replay buffer with random actions, then `updates` updates an iteration."""
 
     learner: DdqnLearner
 
@@ -54,7 +54,7 @@ class OffPolicyTrainer(Trainer):
         return 1.0 if self._prefilling else exploration(self.config, k)
 
     def learn_meanwhile(self, k: int) -> Metrics:
-        """This iteration's updates, on what the replay buffer holds."""
+        """This iteration's updates on the replay buffer."""
         if self._prefilling:
             return {}
         learner, rng = self.learner, generator(self.config.seed, "replay", str(k))
@@ -62,7 +62,7 @@ class OffPolicyTrainer(Trainer):
             learner.update_target()
         losses = [learner.update(self.replay.sample(rng, self.device)) for _ in range(self.config.updates)]
         effects = {}
-        if judged(self.config, k):  # what the network looks at, while it learns
+        if is_validated(self.config, k):  # attribution during training
             past = self.replay.trajectories[0].past
             found = learner.effects(self.replay.sample(rng, self.device), past)
             effects = {f"effect/{name}": value for name, value in found.items()}
@@ -70,27 +70,27 @@ class OffPolicyTrainer(Trainer):
 
     @property
     def _prefilling(self) -> bool:
-        """Whether the replay buffer holds less than is wanted before anything is learned."""
+        """Whether the replay buffer is below the prefill."""
         return self.replay.size < self.config.prefill
 
 
 class OnPolicyTrainer(Trainer):
-    """T's A2C: an iteration learns from its own trajectories, and no replay buffer keeps them."""
+    """T's A2C: an iteration learns from its own trajectories, without a replay buffer."""
 
     learner: A2cLearner
     stores = False
 
     @property
     def keep(self) -> int:  # type: ignore[override]
-        """Every action is drawn from the network's preferences, and kept for so many decisions."""
+        """Decisions that an action drawn from the network's preferences is repeated."""
         return self.config.a2c.keep
 
     def epsilon(self, k: int) -> float:
-        """All of its actions are drawn from the network's preferences."""
+        """0: all actions are drawn from the network's preferences."""
         return 1.0
 
     def learn_afterwards(self, k: int, drives: Sequence[Trajectory]) -> Metrics:
-        """Learn from its own trajectories."""
+        """Updates on this iteration's trajectories."""
         return _named(self.learner.learn(drives, generator(self.config.seed, "order", str(k))))
 
 

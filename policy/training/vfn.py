@@ -1,9 +1,9 @@
-"""Training of the value network (P, algorithm 4; T's A2C): drives elsewhere, updates here, in lock step.
+"""Training of the value network (P, algorithm 4; T's A2C): episodes in actors, updates here, in lock step.
 
-DDQN: iteration k updates the network on what is in the replay buffer while the actors drive its episodes with
-the weights that iteration k began with; then the new trajectories join the replay buffer. A2C learns from its
-latest trajectories only: it waits for them. So every number depends on the configuration and the seed alone,
-not on which process was faster, and a killed run goes on exactly.
+DDQN: iteration k updates the network on the replay buffer while the actors drive its episodes with the
+weights from the start of iteration k; then the new trajectories join the replay buffer. A2C waits for its
+latest trajectories and learns from them only. Every number therefore depends on the configuration and the
+seed alone, not on the speed of processes, and a killed run resumes exactly.
 """
 
 import json
@@ -24,30 +24,30 @@ from cosim.seeding import TUNING_SEEDS
 from policy import checkpoint
 from policy.networks.vfn import VFN, VfnConfig
 from policy.training import curriculum, experience
-from policy.training.curriculum import Drive, Drove, VfnTraining
+from policy.training.curriculum import Drive, DriveResult, VfnTraining
 from policy.training.trainers import make_trainer
 
-LATER = "iterations"  # what a run that goes on may be given otherwise
+EXTENDABLE_FIELD = "iterations"  # the only field that may change when a run is resumed
 
 
 class Actors(Protocol):
-    """Where episodes are driven (cosim.learning.rollouts)."""
+    """The executor of episodes (cosim.learning.rollouts)."""
 
-    def submit(self, drive: Drive) -> Future[Drove]:
-        """Drive it soon."""
+    def submit(self, drive: Drive) -> Future[DriveResult]:
+        """Queue the episode."""
 
 
 class TrainingRun:
-    """`run` trains in `folder`: state, weights (`last` and `best`) and `log.jsonl` lie there.
+    """A training run in `folder`, which holds state, weights (`last` and `best`) and `log.jsonl`.
 
     Args:
         config: the schedule.
         vfn: layout of the network.
-        actors: where episodes are driven.
-        folder: where everything is written; made if it is not there.
+        actors: executor of episodes.
+        folder: output folder; created if missing.
         device: of torch.
         log: TensorBoard's writer.
-        about: what the cards of the weights say besides.
+        about: additional content of the weights' cards.
     """
 
     def __init__(
@@ -64,8 +64,8 @@ class TrainingRun:
         self.config, self.vfn, self.folder = config, vfn, folder
         self._actors, self._log, self._about, self._device = actors, log, dict(about or {}), device
         self.trainer = make_trainer(config, vfn, device)
-        self._files: list[tuple[str, int]] = []  # of the replay buffer, oldest first, and their trajectories
-        self._gone = 0  # trajectories of the oldest file that have left the replay buffer already
+        self._files: list[tuple[str, int]] = []  # replay buffer's files, oldest first, with trajectory counts
+        self._gone = 0  # trajectories of the oldest file that have left the replay buffer
         self.iteration, self.best = 0, -math.inf
         for name in ("replay", "weights"):
             (folder / name).mkdir(parents=True, exist_ok=True)
@@ -73,9 +73,9 @@ class TrainingRun:
     # ---- the loop ----
 
     def run(self, progress: Callable[[float, float], None] | None = None) -> None:
-        """Train to the last iteration, from wherever `resume` left off; else anew, whatever lies there."""
+        """Train to the last iteration, from the state of `resume`; without it from the start."""
         c, trainer = self.config, self.trainer
-        if not self.iteration:  # a run that was killed before its first checkpoint leaves some
+        if not self.iteration:  # remove files of a run killed before its first checkpoint
             for path in (*self.folder.glob("weights/*"), *self.folder.glob("replay/*")):
                 path.unlink()
             (self.folder / "log.jsonl").unlink(missing_ok=True)
@@ -86,7 +86,7 @@ class TrainingRun:
             epsilon = trainer.epsilon(k)
             drives = curriculum.drives(c, k, weights, frozen, epsilon, trainer.keep)
             driving = [self._actors.submit(drive) for drive in drives]
-            judged = curriculum.validation(c, weights) if curriculum.judged(c, k) else []
+            judged = curriculum.validation(c, weights) if curriculum.is_validated(c, k) else []
             judging = [self._actors.submit(drive) for drive in judged]
             losses = trainer.learn_meanwhile(k)
             drove = [f.result() for f in driving]
@@ -112,8 +112,8 @@ class TrainingRun:
             if progress is not None:
                 progress(self.iteration, c.iterations)
 
-    def _keep(self, k: int, drove: Sequence[Drove]) -> None:
-        """Into the replay buffer; files whose trajectories have all left it go with the next checkpoint."""
+    def _keep(self, k: int, drove: Sequence[DriveResult]) -> None:
+        """Add to the replay buffer; files without remaining trajectories go at the next checkpoint."""
         for j, one in enumerate(drove):
             name = f"{k:06d}-{j:02d}.npz"
             experience.save(self.folder / "replay" / name, one.trajectories)
@@ -125,7 +125,7 @@ class TrainingRun:
     def _judge(
         self, figures: list[dict[str, float | None]], source: Path, measured: dict[str, Any]
     ) -> dict[str, Any]:
-        """What the weights in `source` drove in validation; the best are kept, with what was measured."""
+        """Validate the weights in `source`; the best weights are kept with their measured result."""
         means, count = _means("valid", figures), self.config.validation
         for at, lesson in enumerate(self.config.lessons):
             name = f"valid/{Path(lesson.scenario).name}-{lesson.demand}"
@@ -142,7 +142,7 @@ class TrainingRun:
     # ---- files ----
 
     def _weights(self, k: int) -> str:
-        """The file of the weights that iteration `k` began with."""
+        """The file of the weights at the start of iteration `k`."""
         path = self.folder / "weights" / f"{k:06d}.safetensors"
         if not path.is_file():
             if k != self.iteration:
@@ -153,7 +153,7 @@ class TrainingRun:
         return str(path)
 
     def save(self) -> None:
-        """Checkpoint: everything that `resume` needs; whole or not at all."""
+        """Write a checkpoint for `resume` atomically."""
         name = f"state-{self.iteration:06d}.safetensors"
         state = {
             "iteration": self.iteration,
@@ -171,7 +171,7 @@ class TrainingRun:
         with whole(self.folder / "state.json") as draft:
             draft.write_text(json.dumps(state, indent=1))
         self._weights(self.iteration)
-        # remove what no checkpoint needs any more
+        # remove files that no checkpoint references
         kept = {name, *(file for file, _ in self._files)}
         files = [*(self.folder / "replay").glob("*.npz"), *self.folder.glob("state-*.safetensors")]
         oldest = self.iteration - self.iteration % self.config.disseminate
@@ -180,7 +180,7 @@ class TrainingRun:
             path.unlink()
 
     def resume(self) -> bool:
-        """Go on where the last checkpoint was; False when there is none.
+        """Continue from the last checkpoint; False without a checkpoint.
 
         Raises BadInput when the folder was trained with another configuration.
         """
@@ -192,7 +192,7 @@ class TrainingRun:
             name
             for part, own in (("config", self.config), ("vfn", self.vfn), ("about", self._about))
             for name in _differing(state[part], checkpoint.plain(own))
-            if name != LATER
+            if name != EXTENDABLE_FIELD
         ]
         if differs:
             raise BadInput("was trained with another configuration", file=file, field=", ".join(differs))
@@ -205,7 +205,7 @@ class TrainingRun:
         for number, (name, _) in enumerate(self._files):
             trajectories = experience.load(self.folder / "replay" / name)
             self.trainer.replay.add(trajectories[self._gone if number == 0 else 0 :])
-        for path in (self.folder / "weights").glob("*"):  # they will be learned again
+        for path in (self.folder / "weights").glob("*"):  # later weights will be learned again
             if int(path.stem) > self.iteration:
                 path.unlink()
         log = self.folder / "log.jsonl"
@@ -224,7 +224,7 @@ class TrainingRun:
 
 
 def _differing(theirs: Mapping[str, Any], mine: Mapping[str, Any], where: str = "") -> list[str]:
-    """The fields that one has not, or with another value: `safety.dt`."""
+    """Names of fields that differ or are missing on one side, such as `safety.dt`."""
     found = []
     for name in theirs.keys() | mine.keys():
         old, new = theirs.get(name, ...), mine.get(name, ...)
@@ -236,7 +236,7 @@ def _differing(theirs: Mapping[str, Any], mine: Mapping[str, Any], where: str = 
 
 
 def _means(prefix: str, figures: Sequence[Mapping[str, float | None]]) -> dict[str, float]:
-    """Mean of every figure over the episodes that have it."""
+    """Mean of every figure over the episodes with a value."""
     out = {}
     for name in figures[0] if figures else ():
         known = [float(v) for f in figures if (v := f[name]) is not None]

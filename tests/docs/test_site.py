@@ -13,7 +13,7 @@ from urllib.parse import unquote, urlsplit
 import pytest
 
 from cosim.cli import COMMANDS
-from cosim.cli.reference import PLACE
+from cosim.cli.reference import PLACEHOLDER
 from tests.service.browser import Tab, launched, needed
 
 ROOT = Path(__file__).parents[2]
@@ -120,7 +120,7 @@ def test_the_command_line_is_written_from_the_parser(site: Path) -> None:
     page = (site / "reference" / "command_line.html").read_text(encoding="utf-8")
     assert [name for name in COMMANDS if f'id="cosim-{name}"' not in page] == []
     assert "--on-collision" in page
-    assert PLACE not in page
+    assert PLACEHOLDER not in page
 
 
 def test_the_python_reference_is_written_from_the_docstrings(site: Path) -> None:

@@ -7,16 +7,16 @@ from concurrent.futures import Future
 import pytest
 
 from cosim.learning.announcement import Announced, begin
-from policy.training.curriculum import Drive, Drove, Lesson, VfnTraining
+from policy.training.curriculum import Drive, DriveResult, Lesson, VfnTraining
 from tests.learning.test_vfn_training import trajectory
 
 
 class Recorders:
     """Each drive ends at once, with ten decisions."""
 
-    def submit(self, drive: Drive) -> Future[Drove]:
-        future: Future[Drove] = Future()
-        future.set_result(Drove([trajectory([1] * 10, [(0, 0, 0)] * 10)], {}))
+    def submit(self, drive: Drive) -> Future[DriveResult]:
+        future: Future[DriveResult] = Future()
+        future.set_result(DriveResult([trajectory([1] * 10, [(0, 0, 0)] * 10)], {}))
         return future
 
 

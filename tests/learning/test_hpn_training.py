@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from policy.networks.kinematic_branch import KinematicBranch, KinematicConfig, correct, sureness
+from policy.networks.kinematic_branch import KinematicBranch, KinematicConfig, confidence, correct
 from policy.prediction.vehicle_inputs import NEIGHBOUR_INPUTS, NEIGHBOURS, own_inputs
 from policy.training.kinematics import KinematicTask, KinematicTraining, collate
 from policy.training.moments import Moment
@@ -58,7 +58,7 @@ def test_it_learns_who_brakes_and_how_sure_that_is() -> None:
     tame = (batch.own[:, WILD] == 0) & (batch.own[:, CLOSING] == 1)
     moved = (guess - batch.lane)[tame, -1, 0].mean()
     assert -14.0 < moved < -10.0, "1.5 m/s2 for 4 s are 12 m"
-    share = sureness(raw[batch.seen][..., 5], raw[batch.looking][..., 6])[:, -1]
+    share = confidence(raw[batch.seen][..., 5], raw[batch.looking][..., 6])[:, -1]
     wild = batch.own[batch.seen][:, WILD] == 1
     assert share[wild].mean() < 0.4
     assert share[~wild].mean() > share[wild].mean() + 0.2

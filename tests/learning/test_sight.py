@@ -29,7 +29,7 @@ from policy.training.curriculum import Drive, Lesson, VfnTraining
 from policy.training.ddqn import DdqnConfig, DdqnLearner
 from policy.training.explorer import ExploreConfig, Explorer
 from policy.training.replay_buffer import ReplayBuffer, ReplayConfig
-from policy.training.sight import AHEAD, ALONG, BRISK, READINGS, Seen, SightTask
+from policy.training.sight import ALONG_SCALE, MAX_GAP, READINGS, SPEED_SCALE, Seen, SightTask
 from policy.training.trainers import make_trainer
 from tests.learning.test_vfn_training import TINY, fake_episode, trajectory
 
@@ -59,19 +59,19 @@ def test_a_band_tells_of_the_nearest_vehicle_ahead_and_behind() -> None:
             (10, -9.0, 0, 0, 1),
         )
     )
-    assert read(found, "gap ahead, own band") == pytest.approx(30 / AHEAD, abs=1e-3)
-    assert read(found, "speed ahead, own band") == pytest.approx(-5 / BRISK, abs=1e-3)
-    assert read(found, "gap behind, left band") == pytest.approx(40 / AHEAD, abs=1e-3)
-    assert read(found, "speed behind, left band") == pytest.approx(6 / BRISK, abs=1e-3)
+    assert read(found, "gap ahead, own band") == pytest.approx(30 / MAX_GAP, abs=1e-3)
+    assert read(found, "speed ahead, own band") == pytest.approx(-5 / SPEED_SCALE, abs=1e-3)
+    assert read(found, "gap behind, left band") == pytest.approx(40 / MAX_GAP, abs=1e-3)
+    assert read(found, "speed behind, left band") == pytest.approx(6 / SPEED_SCALE, abs=1e-3)
     assert read(found, "gap ahead, right band") == 1.0, "nobody"
     assert read(found, "mission vehicle, presence") == 1.0
-    assert read(found, "mission vehicle, along") == pytest.approx(10 / ALONG, abs=1e-3)
+    assert read(found, "mission vehicle, along") == pytest.approx(10 / ALONG_SCALE, abs=1e-3)
 
 
 def test_a_frame_later_is_seen_from_where_the_ego_is_then() -> None:
     """The rows stay in the frame of the newest perceived instant; a predicted map is drawn around the ego."""
     turned = rows((40, 20, 10, 1, 0), (40, 45, 12, 0, 0), heading=np.pi / 2)
-    assert read(sight.bands(turned), "gap ahead, own band") == pytest.approx(25 / AHEAD, abs=1e-3)
+    assert read(sight.bands(turned), "gap ahead, own band") == pytest.approx(25 / MAX_GAP, abs=1e-3)
 
 
 def test_without_a_mission_vehicle_there_is_no_place_to_tell() -> None:
@@ -95,7 +95,7 @@ def test_the_lanes_are_those_of_the_situation() -> None:
 def test_it_learns_to_read_a_gap_off_the_map_and_nothing_off_an_empty_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sight, "RATE", 3e-3)
+    monkeypatch.setattr(sight, "LEARNING_RATE", 3e-3)
     rng = np.random.default_rng(0)
 
     def drawn(count: int) -> Seen:

@@ -30,7 +30,7 @@ from policy.training import experience
 from policy.training.a2c import A2cConfig, A2cLearner
 from policy.training.curriculum import (
     Drive,
-    Drove,
+    DriveResult,
     Lesson,
     VfnTraining,
 )
@@ -293,14 +293,14 @@ def test_a_crashed_av_ends_its_drive_and_the_others_are_cut() -> None:
 class Pretend:
     """Actors whose drives are made up from the seed."""
 
-    def submit(self, drive: Drive) -> Future[Drove]:
+    def submit(self, drive: Drive) -> Future[DriveResult]:
         rng = generator(drive.seed, "pretend")
         drives = []
         if drive.record:
             actions = [int(a) for a in rng.integers(5, size=12)]
             drives = [trajectory(actions, [tuple(x) for x in rng.random((12, 3))])]
-        future: Future[Drove] = Future()
-        future.set_result(Drove(drives, {"reward": float(rng.random()), "crashed": 0.0}))
+        future: Future[DriveResult] = Future()
+        future.set_result(DriveResult(drives, {"reward": float(rng.random()), "crashed": 0.0}))
         return future
 
 
@@ -422,7 +422,7 @@ def test_values_that_are_apart_are_weighed_by_phi() -> None:
     phi = torch.deg2rad(torch.tensor([0.0, 30.0, 60.0, 90.0]))
     now = batch.now._replace(phi=torch.stack([phi.cos(), phi.sin()], 1).repeat(16, 1))
     with torch.no_grad():
-        apart, q = learner.online.apart(*now)[:4], learner.online(*now)[:4]
+        apart, q = learner.online.part_values(*now)[:4], learner.online(*now)[:4]
     fast, slow = int(MetaAction.ACCELERATE), int(MetaAction.DECELERATE)
     assert q.argmax(1).tolist() == [fast, fast, slow, slow]
     assert apart[:, 0, fast].tolist() == pytest.approx([0.2] * 4, abs=0.05)  # reward x 0.1

@@ -10,11 +10,11 @@ import torch
 from policy_scenes import Car, histories, straight_road
 
 from cosim.types import KINEMATIC_FEATURES
-from policy.inputs.situation import FAR, MISSION, PER_LANE, SITUATION_INPUTS, situation
-from policy.inputs.tensors import KINEMATIC_INPUTS, apart, kinematic_tensor, svo_tensor, to_batch
+from policy.inputs.situation import MAX_DISTANCE, MISSION_START, PER_LANE, SITUATION_INPUTS, situation
+from policy.inputs.tensors import KINEMATIC_INPUTS, kinematic_tensor, svo_tensor, to_batch, to_planes
 from policy.networks import extractors
 from policy.networks.hpn import HPN, HpnConfig
-from policy.networks.kinematic_branch import KinematicBranch, KinematicConfig, correct, sureness
+from policy.networks.kinematic_branch import KinematicBranch, KinematicConfig, confidence, correct
 from policy.networks.map_branch import MapBranch, MapBranchConfig
 from policy.networks.vfn import VFN, Frames, VfnConfig
 from policy.prediction.vehicle_inputs import NEIGHBOUR_INPUTS, NEIGHBOURS, own_inputs
@@ -145,7 +145,7 @@ def test_an_untrained_kinematic_branch_leaves_the_forecast_along_the_lane_as_it_
     torch.testing.assert_close(correct(raw, lane, lane), lane)
     aside = correct(raw, lane, lane + 1.0) - lane
     assert ((aside > 0.1) & (aside < 0.15)).all(), "an eighth of the way to the other forecast"
-    assert (sureness(raw[..., 5], raw[..., 6]) > 0.97).all()
+    assert (confidence(raw[..., 5], raw[..., 6]) > 0.97).all()
 
 
 def test_a_correction_is_ahead_and_aside_of_where_the_vehicle_is_heading() -> None:
@@ -237,13 +237,13 @@ def test_the_avs_know_in_which_order_they_reach_the_mission_vehicle() -> None:
     ]
     seen = histories(road, cars)
     order = ("ahead", "guide", "later")
-    known = situation([seen[name] for name in order], road, shared=True)[:, MISSION:]
+    known = situation([seen[name] for name in order], road, shared=True)[:, MISSION_START:]
     assert known[:, 0].tolist() == [1.0] * 3, "their lanes lie side by side"
-    assert np.diff(known[:, 1]) * FAR == pytest.approx([40.0, 30.0])
+    assert np.diff(known[:, 1]) * MAX_DISTANCE == pytest.approx([40.0, 30.0])
     assert known[:, 2] == pytest.approx([-1.0, known[0, 1], known[1, 1]]), "who arrives next before it"
     assert known[:, 3:5].tolist() == [[0.0, 1.0]] * 3, "beside, from the right"
     assert known[:, 5] == pytest.approx([0.6] * 3)
-    alone = situation([seen[name] for name in order], road, shared=False)[:, MISSION:]
+    alone = situation([seen[name] for name in order], road, shared=False)[:, MISSION_START:]
     assert alone[:, 2].tolist() == [-1.0] * 3, "without V2V nobody knows of the others"
 
 
@@ -301,7 +301,7 @@ def test_a_citys_frames_are_read_in_parts_to_the_bit(
             return memory.frames(list("abcde"), maps)
 
     whole = read()
-    monkeypatch.setattr(extractors, "AT_ONCE", 40)  # two parts; below 16 frames some processors round
+    monkeypatch.setattr(extractors, "FRAMES_PER_BATCH", 40)  # two parts; below 16 some CPUs round
     assert torch.equal(read(), whole)
 
 
@@ -314,7 +314,7 @@ def test_maps_read_apart_say_who_is_where_and_how_fast() -> None:
     maps[0, 0, 2, 1], maps[0, 1, 3, 5], maps[0, 3, 3, 5], maps[0, 3, 4, 4] = (
         pixel(5.0), pixel(-10.0), pixel(-10.0), pixel(0.0)
     )  # fmt: skip
-    *present, speed = apart(maps)[0]
+    *present, speed = to_planes(maps)[0]
     assert torch.equal(torch.stack(present), (maps[0] > 0).to(torch.float32))
     assert float(speed[2, 1]) == pytest.approx(5.0 / 15.0, abs=0.01)
     assert float(speed[3, 5]) == pytest.approx(-10.0 / 15.0, abs=0.01)

@@ -16,7 +16,7 @@ from policy.prediction.gp import GaussianProcessIndirect
 from policy.prediction.kernel_prior import PriorNetwork, describe
 from policy.prediction.lane import along_lanes
 from policy.prediction.learned import KinematicNet, Learned, NetConfig
-from policy.prediction.past import ORDINARY, trailing_run, whole_past
+from policy.prediction.past import MAX_PAST_ACCEL, trailing_run, whole_past
 from policy.prediction.predictors import PREDICTORS, make_predictor
 from policy.training.predictors import (
     in_own_frame,
@@ -171,7 +171,7 @@ def test_an_unknown_past_went_as_the_oldest_known_frames_show() -> None:
     np.testing.assert_allclose(past[1, :, 3], 0.3 * TIME, atol=1e-9)
     whole = cars(np.full((1, 10), 12.0), 0.3 * TIME[None])[0]
     np.testing.assert_allclose(past[1, :, :2], whole[:, :2], atol=0.02)
-    np.testing.assert_allclose(np.diff(past[2, :7, 2]), -ORDINARY * 0.2, err_msg="no emergency for 2 s")
+    np.testing.assert_allclose(np.diff(past[2, :7, 2]), -MAX_PAST_ACCEL * 0.2, err_msg="no emergency for 2 s")
     np.testing.assert_allclose(past[3, :, 0], 100.0 + 9.0 * TIME)
     gone = whole_past(state[:1], np.zeros(1, np.int64), 10, 0.2)
     assert (gone == 0.0).all()

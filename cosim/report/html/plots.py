@@ -21,7 +21,7 @@ from matplotlib.ticker import MaxNLocator
 from cosim.report import statistics, wording
 from cosim.report.html.blocks import Block, Series
 
-CRITICAL_TTC = 1.5  # s; a shorter one is a serious conflict (cosim.metrics.time_to_collision)
+CRITICAL_TTC = 1.5  # s, bound of a serious conflict (cosim.metrics.time_to_collision)
 TTC_HORIZON = 10.0  # s; a longer one is NA
 BIN_S = 0.5
 WIDTH_INCHES = 5.6  # an inch is 72 px on the page, so a phone shows letters almost full size

@@ -61,7 +61,7 @@ def document(replay: ReplayData) -> dict[str, Any]:
 
 
 class Names:
-    """Numbers in place of vehicles and of words, which are written once; word 0 is nobody.
+    """Numbers in place of vehicles and words, which are written once; word 0 is empty.
 
     What concerns a vehicle without a number is left out.
     """

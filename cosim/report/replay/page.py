@@ -18,7 +18,7 @@ VIEWER = (
     "draw.js",
     "panel.js",
     "main.js",
-)  # what draws, whoever brings the data
+)  # scripts of the viewer, independent of the data's source
 
 
 def page(replay: ReplayData) -> str:

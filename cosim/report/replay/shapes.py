@@ -1,4 +1,4 @@
-"""What actors look like from above: polygons that the page and the film both draw."""
+"""Shapes of actors from above: polygons for the page and the film."""
 
 import math
 from collections.abc import Mapping
@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from cosim.types import Actor
 
 Shape = tuple[tuple[str, tuple[tuple[float, float], ...]], ...]
-BODY, LIGHT, DARK = "body", "light", "dark"  # in the colour of who drives; bright; nearly black
-LEAST = {Actor.PERSON: (0.7, 0.9), Actor.BICYCLE: (1.8, 0.8)}  # m, drawn at least so long and wide
+BODY, LIGHT, DARK = "body", "light", "dark"  # in the colour of the driver; bright; nearly black
+LEAST = {Actor.PERSON: (0.7, 0.9), Actor.BICYCLE: (1.8, 0.8)}  # m, minimum drawn length and width
 NAMES = {
     Actor.CAR: "car",
     Actor.TRUCK: "truck",

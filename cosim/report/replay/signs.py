@@ -1,4 +1,4 @@
-"""What stands where a lane enters a junction: stop line, sign, signals, and pedestrian crossings."""
+"""Signs at the end of a lane at a junction: stop line, sign, signals, and pedestrian crossings."""
 
 import math
 from itertools import pairwise

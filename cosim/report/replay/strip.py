@@ -17,8 +17,8 @@ from cosim.road import Rule
 from cosim.types import Actor, Floats, Kind, MetaAction
 
 FINE = 2  # drawn this much larger, then reduced: smooth edges
-ACROSS = 200.0  # m of road in the picture's width
-SEEN = 10.0  # pixels that persons and bicycles are long at least
+ACROSS = 200.0  # m of road across the picture's width
+SEEN = 10.0  # pixels, minimum length of persons and bicycles
 SIGMAS = 2.0  # half the width of a predicted interval, in standard deviations
 
 GROUND, ROAD, EDGE, JUNCTION = (238, 241, 244), (201, 206, 214), (255, 255, 255), (188, 194, 203)
@@ -54,7 +54,7 @@ class Pose(NamedTuple):
 
 
 def poses_at(r: ReplayData, time: float) -> list[Pose]:
-    """Everybody on the road at `time` s, on the straight line between two frames."""
+    """All vehicles and persons at `time` s, interpolated linearly between two frames."""
     k = max(int(np.searchsorted(r.times, time + 1e-6, side="right")) - 1, 0)
     span = r.times[k + 1] - r.times[k] if k + 1 < len(r.times) else 1.0
     u = min(max((time - r.times[k]) / span, 0.0), 1.0)
@@ -214,7 +214,7 @@ class Strip:
             self._pen.polygon(pixels, fill=fills.get(name, (255, 32, 32)), outline=rim, width=FINE)
 
     def choice(self, p: Pose, c: Choice, others: Mapping[str, Pose]) -> None:
-        """The command beside the car; a ring where it was vetoed, a line to who was blamed."""
+        """The command beside the car; a ring for a veto, a line to the blamed vehicle."""
         d = c.decision
         if d.vetoed or d.fallback:
             colour = BAD if d.fallback else WARN
@@ -228,17 +228,17 @@ class Strip:
             self._text(x, y, sign, BAD if c.blocked else AV, 15, bold=True)
 
     def broken(self, p: Pose, what: str) -> None:
-        """The law that it broke, beneath it."""
+        """The violated law, below the car."""
         x, y = self._pixel(p.x, p.y - p.track.width / 2 - 2.6)
         self._text(x, y, what, LAW, 12, bold=True)
 
     def corrected(self, p: Pose) -> None:
-        """A square around an AV that its car corrected."""
+        """A square around an AV with an intervention of its car."""
         side = 0.62 * p.track.length * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
         self._pen.line(self._pixels(side + np.array([p.x, p.y])), fill=CORRECTION, width=2 * FINE)
 
     def erring(self, p: Pose, other: Pose | None) -> None:
-        """A triangle on who errs, and a line to whom it meets first."""
+        """A triangle on a driver in error, and a line to the vehicle affected first."""
         x, y = self._pixel(p.x, p.y)
         if other is not None:
             self._pen.line([(x, y), self._pixel(other.x, other.y)], fill=(*ERROR, 170), width=FINE)

@@ -112,7 +112,7 @@ def _pictures(
 
 
 class _Camera:
-    """Whom the film follows, where it looks while that vehicle is not on the road, and what stands there."""
+    """The camera: the followed vehicle, and the view while that vehicle is off the road."""
 
     def __init__(self, replay: ReplayData, follow: str | None) -> None:
         def rank(t: Track) -> tuple[bool, bool, bool, int]:
@@ -195,7 +195,7 @@ class _Board:
         self._pen = ImageDraw.Draw(self.picture)
 
     def legend(self, r: ReplayData) -> None:
-        """Which colour is who, then which shape is what, at the top."""
+        """The legend of colours and shapes, at the top."""
         mission = "mission vehicle" + ", guessed" * bool(r.facts.get("mission_guessed"))
         cars = {mission if t.mission else _driver(t): (Actor.CAR, colour_of(t)) for t in r.tracks}
         cars.pop("", None)  # of persons
@@ -212,7 +212,7 @@ class _Board:
             x += wide
 
     def caption(self, r: ReplayData, time: float) -> None:
-        """One line: who drives, what has come of it, when."""
+        """One line: policy, outcome, time."""
         top = self._line_top + 4
         policy = str(r.facts.get("policy"))
         self._line(14, top, policy, TEXT, 13, bold=True)
@@ -320,7 +320,7 @@ class _Board:
 
 
 def _driver(t: Track) -> str:
-    """Who drives; "" where nobody does."""
+    """The driver in words; "" without one."""
     return "AV" if t.kind == Kind.AV else "" if t.kind == Kind.PERSON else f"human, {t.driver}"
 
 
@@ -330,7 +330,7 @@ def _kind(t: Track) -> str:
 
 
 def _outcome(r: ReplayData, time: float) -> tuple[str, Colour]:
-    """What has happened so far, in a few words."""
+    """The events so far, in a few words."""
     crashes = [c for c in r.collisions if c.time <= time + 0.05]
     if crashes:
         return f"collision: {crashes[-1].collider} hit {crashes[-1].victim}", BAD

@@ -6,7 +6,7 @@ import numpy as np
 
 from cosim.scenario.tilt import Tilt, case, log_ratio
 from cosim.simulation.backend import sumo
-from cosim.types import REMEMBERED, Bools
+from cosim.types import ERROR_MEMORY, Bools
 
 TILT_RADIUS = 60.0  # m around an AV, in which errors may be tilted
 MAX_TILTED_ERRORS = 2  # per episode, drawn from raised probabilities
@@ -41,7 +41,7 @@ class Tilted:
     ) -> None:
         """Call before the trials of a second. `erring`: erring drivers; `ended`: end times of errors, s."""
         if self._tilt is not None and self._begun < MAX_TILTED_ERRORS:
-            recent = {driver for driver, end in ended.items() if now - end <= REMEMBERED}
+            recent = {driver for driver, end in ended.items() if now - end <= ERROR_MEMORY}
             known = [name for name in names if name in erring or name in recent]
             self._near, self._during = _beside_avs(names, avs, known)
 

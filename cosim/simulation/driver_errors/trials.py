@@ -18,7 +18,7 @@ from cosim.simulation.driver_errors.kind import ErrorKind, UnderWay
 from cosim.simulation.driver_errors.surroundings import Surroundings, leader
 from cosim.simulation.driver_errors.tilted import Tilted
 from cosim.simulation.drivers import Drivers
-from cosim.types import REMEMBERED, Collision, HumanError, Kind
+from cosim.types import ERROR_MEMORY, Collision, HumanError, Kind
 
 # In the order of their trials: per second, per manoeuvre, then of persons.
 KINDS: tuple[type[ErrorKind], ...] = (
@@ -202,6 +202,6 @@ class HumanErrors:
         now = collision.time
         pair = [collision.collider, collision.victim]
         return any(
-            name in self._under_way or now - self._ended.get(name, -math.inf) <= REMEMBERED
+            name in self._under_way or now - self._ended.get(name, -math.inf) <= ERROR_MEMORY
             for name in (*pair, *filter(None, map(leader, pair)))
         )

@@ -1,4 +1,4 @@
-"""Who drives along an AV's lanes, and how its way meets a mission vehicle's: geometry on the road map."""
+"""Vehicles along an AV's lanes, and its conflict with a mission vehicle: geometry on the road map."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ from cosim.geometry.compiled import compiled
 from cosim.road import LanePath, RoadMap
 from cosim.types import IS_MISSION, Bools, Floats, Floats32, History, Ints
 
-LANE = 3.2  # m, SUMO's lane width
-CAR = 5.0  # m, between the centres of two cars that touch
+LANE_WIDTH = 3.2  # m, SUMO's default
+CAR_LENGTH = 5.0  # m, SUMO's default passenger car
 
 
 class Seen(NamedTuple):
-    """The mission vehicle as one AV perceives it and shares it with the others."""
+    """The mission vehicle as perceived by one AV and shared with the others."""
 
     lane: int  # index into RoadMap.lanes
     lane_position: float  # m, front bumper
@@ -24,17 +24,17 @@ class Seen(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Meeting:
-    """How an AV stands to a mission vehicle whose way meets its own."""
+class Conflict:
+    """An AV's conflict with a mission vehicle: their paths cross or run into adjacent lanes."""
 
-    behind: float  # m, how far behind the mission vehicle it will arrive where their ways meet
-    crossing: bool  # their ways cross at a junction (else their lanes lie side by side)
+    behind: float  # m, the AV's lag behind the mission vehicle at the conflict point
+    crossing: bool  # their paths cross at a junction (else their lanes are adjacent)
     from_right: bool  # the mission vehicle's lane lies to the right
     speed: float  # m/s, of the mission vehicle
 
 
 def missions(histories: Iterable[History]) -> dict[str, Seen]:
-    """Every mission vehicle that any of these AVs perceives (V2V: not everybody is near enough to)."""
+    """Every mission vehicle that any of these AVs perceives (V2V: some AVs are out of range)."""
     return {
         h.ids[r]: Seen(int(h.lane[r]), float(h.lane_position[r]), float(h.kinematics[-1, r, 2]))
         for h in histories
@@ -42,29 +42,29 @@ def missions(histories: Iterable[History]) -> dict[str, Seen]:
     }
 
 
-def meet(road: RoadMap, history: History, seen: Seen) -> Meeting | None:
-    """Where this AV's way meets the mission vehicle's; None when it does not."""
+def find_conflict(road: RoadMap, history: History, seen: Seen) -> Conflict | None:
+    """This AV's conflict with the mission vehicle; None without a conflict."""
     own = history.route.paths[1]
     if own is None or seen.lane < 0:
         return None
     theirs = road.path(seen.lane)
-    place = seen.lane_position * theirs.scale  # m, their front bumper
+    place = seen.lane_position * theirs.scale  # m, the mission vehicle's front bumper
     beside = _beside(road, own, theirs)
     if beside is not None:
         mine, other, right = beside
-        return Meeting((mine - history.route.arc) - (other - place), False, right, seen.speed)
+        return Conflict((mine - history.route.arc) - (other - place), False, right, seen.speed)
     if not (np.isfinite(own.conflict) and _crosses_junction(road, theirs)):
-        return None  # no conflict: the own lane lies beside the one they want
+        return None  # no conflict: the ego's lane is adjacent to the mission vehicle's target lane
     if _same_approach(road, own, theirs):
         return None
     behind = history.route.conflict_distance - max(theirs.conflict - place, 0.0)
-    return Meeting(behind, True, False, seen.speed)
+    return Conflict(behind, True, False, seen.speed)
 
 
 def along(history: History, path: LanePath, side: float = 0.0) -> Floats:
     """Vehicles on the path's next lanes, or behind on its course [k,2]: m ahead of the ego (centres), m/s.
 
-    Upstream a lane has other names, so behind it is the place that counts: `side` m to the left.
+    Upstream lanes have other indices, so vehicles behind are matched by position: `side` m to the left.
     """
     return _along(history.kinematics[-1], history.valid[-1], history.lane, path.next_lanes, side)
 
@@ -76,7 +76,7 @@ def _along(newest: Floats32, valid: Bools, lane: npt.NDArray[np.int32], lanes: I
     for r in range(1, len(valid)):
         if not valid[r]:
             continue
-        on = newest[r, 0] < 0.0 and abs(newest[r, 1] - side) < 0.5 * LANE
+        on = newest[r, 0] < 0.0 and abs(newest[r, 1] - side) < 0.5 * LANE_WIDTH
         for one in lanes:
             on = on or lane[r] == one
         if on:
@@ -86,18 +86,18 @@ def _along(newest: Floats32, valid: Bools, lane: npt.NDArray[np.int32], lanes: I
 
 
 def _crosses_junction(road: RoadMap, path: LanePath) -> bool:
-    """Whether the conflict zone that the path meets lies inside a junction."""
+    """Whether the path's conflict zone lies inside a junction."""
     return any(road.lanes[i].internal and any(i in zone.lanes for zone in road.zones) for i in path.lanes)
 
 
 def _same_approach(road: RoadMap, own: LanePath, theirs: LanePath) -> bool:
-    """Whether both come along the same edge, lanes apart."""
+    """Whether both paths use the same edge on different lanes."""
     edges = {road.lanes[i].edge for i in own.lanes if not road.lanes[i].internal}
     return road.lanes[theirs.lanes[0]].edge in edges
 
 
 def _beside(road: RoadMap, own: LanePath, theirs: LanePath) -> tuple[float, float, bool] | None:
-    """Where their lane comes to lie beside ours: arc on our path, arc on theirs, and whether on our right."""
+    """Where the other lane becomes adjacent: arc on the own path, arc on the other, whether on the right."""
     place = {lane: float(start) for lane, start in zip(own.lanes, own.lane_start, strict=True)}
     for lane, start in zip(theirs.lanes, theirs.lane_start, strict=True):
         left, right = road.lanes[lane].left, road.lanes[lane].right

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import importlib
+import math
 import multiprocessing
 import sys
 from collections.abc import Mapping, Sequence
@@ -39,7 +40,7 @@ def drive(case: Case, columns: Sequence[str]) -> tuple[Any, ...]:
         getattr(rules, name)
         setattr(rules, name, value)
     row = EpisodeRunner().run(EpisodeOptions(**case.options), (), None, lambda *_, **__: None)
-    return tuple(row[column] for column in columns)
+    return tuple(math.nan if row[column] is None else row[column] for column in columns)
 
 
 def measure(kind: type[Row], cases: Sequence[Case], workers: int, file: Path, again: bool) -> list[Row]:
@@ -74,7 +75,7 @@ def read(kind: type[Row], file: Path) -> list[Row]:
         return []
     types = get_type_hints(kind)
     with file.open(encoding="utf-8", newline="") as lines:
-        return [kind(*(types[k](v) for k, v in row.items())) for row in csv.DictReader(lines)]
+        return [kind(*(types[k](v or "nan") for k, v in row.items())) for row in csv.DictReader(lines)]
 
 
 def write(file: Path, columns: Sequence[str] | Mapping[str, Any], rows: Sequence[tuple[Any, ...]]) -> None:

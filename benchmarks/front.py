@@ -73,10 +73,10 @@ class Drive(NamedTuple):
     errors: str
     seed: int
     total_delay_s: float
-    av_involved_collisions: int
-    av_caused_collisions: int
+    av_involved_collisions: float
+    av_caused_collisions: float
     av_km: float
-    hard_brakings_av: int
+    hard_brakings_av: float
 
 
 def case(habit: str, road: str, errors: str, seed: int, duration: float | None) -> Case:
@@ -96,7 +96,7 @@ class Point(NamedTuple):
     habit: str
     delays: tuple[float, ...]  # s, of everybody, by road, errors `field`
     hit: Rate  # collisions that an AV was in, in `PER` AV-km, errors `stress`
-    caused: int
+    caused: float
     brakings: float  # hard ones of AVs in an AV-km, errors `field`
 
     @property
@@ -114,9 +114,9 @@ def points(rows: Sequence[Drive]) -> Iterator[Point]:
         if not all(late) or not stress:
             continue
         hits, km = ([getattr(row, c) for row in stress] for c in ("av_involved_collisions", "av_km"))
-        hit = pooled_rate(hits, [one / PER for one in km]) if any(km) else Rate(*[math.nan] * 3)
+        hit = pooled_rate(hits, [one / PER for one in km]) if sum(km) > 0.0 else Rate(*[math.nan] * 3)
         driven = sum(row.av_km for row in calm)
-        brakings = sum(row.hard_brakings_av for row in calm) / driven if driven else math.nan
+        brakings = sum(row.hard_brakings_av for row in calm) / driven if driven > 0.0 else math.nan
         caused = sum(row.av_caused_collisions for row in stress)
         yield Point(habit, tuple(map(fmean, late)), hit, caused, brakings)
 
@@ -134,8 +134,9 @@ def page(rows: Sequence[Drive]) -> list[str]:
     return WORDS.format(
         table="\n".join([lines[0], "|---" * (len(columns) + 1) + "|", *lines[1:]]),
         picture=PICTURE,
-        seeds=f"{seeds[0]} to {seeds[-1]}",
-        n=len(seeds),
+        seeds=", ".join(map(str, seeds)),
+        first=seeds[0],
+        end=seeds[-1] + 1,
         data=DATA,
     ).splitlines()
 
@@ -145,7 +146,7 @@ def _cells(one: Point) -> list[str]:
     if math.isnan(one.hit.value):
         return [*delays, "", "", ""]
     hit = f"{one.hit.value:.0f} ({one.hit.low:.0f} to {one.hit.high:.0f})"
-    return [*delays, hit, str(one.caused), f"{one.brakings:.2f}"]
+    return [*delays, hit, f"{one.caused:.0f}", f"{one.brakings:.2f}"]
 
 
 def picture(rows: Sequence[Drive], file: Path) -> None:
@@ -173,9 +174,9 @@ def picture(rows: Sequence[Drive], file: Path) -> None:
 
 WORDS = """# The lawful car: what each habit costs and buys
 
-Each row takes one habit of the car away, or changes one of its constants, on the same drives. Delay
-is everybody's, under the driver errors `field`. Collisions are those with an AV in 1,000 AV-km, under
-`stress`, with 95 % intervals. Hard brakings are those of AVs in an AV-km, under `field`.
+Each row takes one habit of the car away, or changes one of its constants, on the same drives.
+Delay is everybody's, under the driver errors `field`. Collisions are those with an AV in 1,000
+AV-km, under `stress`, with 95 % intervals. Hard brakings are those of AVs in an AV-km, under `field`.
 
 {table}
 
@@ -183,10 +184,13 @@ is everybody's, under the driver errors `field`. Collisions are those with an AV
 
 ## Conditions
 
-Demand `over`, drivers `moderate`, 20 % AVs that always ask for more speed, sensing `ideal`. Validation
-seeds {seeds} ({n} of each); each delay is a mean over them. One seed scatters by a third, so that small
-differences of delay say nothing. Rows: [{data}]({data}). To go on: `python -m benchmarks.front`, with
-more seeds: `--seeds A:B`.
+Demand `over`, drivers `moderate`, 20 % AVs that always ask for more speed, sensing `ideal`.
+Validation seeds: {seeds}. Each delay is a mean over them. One seed scatters by a third, so small
+differences of delay say nothing. Rows: [{data}]({data}).
+
+```
+python -m benchmarks.front --seeds {first}:{end}
+```
 """
 
 

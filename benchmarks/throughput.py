@@ -41,11 +41,11 @@ class Drive(NamedTuple):
     network: str
     driver: str
     seed: int
-    arrivals: int
+    arrivals: float
     total_delay_s: float
-    avs_stuck: int
-    av_involved_collisions: int
-    av_caused_collisions: int
+    avs_stuck: float
+    av_involved_collisions: float
+    av_caused_collisions: float
 
 
 def cases(configs: Sequence[Path], seeds: range, every: bool, duration: float) -> Iterator[Case]:
@@ -77,7 +77,7 @@ def page(rows: Sequence[Drive]) -> list[str]:
                 [
                     *(network, str(len(seeds)), f"{sum(arrived[NONE]) / len(seeds):,.0f}"),
                     *(_change(arrived[NONE], arrived[driver]) for driver in others),
-                    *(str(sum(row.avs_stuck for row in cars)), f"{hits}, {caused}"),
+                    *(f"{sum(row.avs_stuck for row in cars):.0f}", f"{hits:.0f}, {caused:.0f}"),
                 ]
             )
         )

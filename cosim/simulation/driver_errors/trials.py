@@ -120,7 +120,7 @@ class HumanErrors:
 
     def attribute(self, collisions: Sequence[Collision]) -> list[Collision]:
         """The collisions with `human_error_involved` set: whether collider, victim or a leader of either has
-        an active error, or had one at most `REMEMBERED` s before."""
+        an active error, or had one at most `ERROR_MEMORY` s before."""
         return [replace(c, human_error_involved=self._involves_error(c)) for c in collisions]
 
     @property

@@ -176,7 +176,8 @@ WORDS = """# The lawful car: what each habit costs and buys
 
 Each row takes one habit of the car away, or changes one of its constants, on the same drives.
 Delay is everybody's, under the driver errors `field`. Collisions are those with an AV in 1,000
-AV-km, under `stress`, with 95 % intervals. Hard brakings are those of AVs in an AV-km, under `field`.
+AV-km, under `stress`, with 95 % intervals. Hard brakings are those of AVs in an AV-km, under
+`field`.
 
 {table}
 

@@ -156,6 +156,12 @@ def front(place: Place) -> list[list[str]]:
     return [["benchmarks.front", *few, "--out", str(place.out)]]
 
 
+def throughput(place: Place) -> list[list[str]]:
+    """What AVs do to the arrivals of foreign networks."""
+    few = ["--nets", "corridor", "--seeds", "300000:300001", "--duration", "30"] if place.small else []
+    return [["benchmarks.throughput", *few, "--out", str(place.out)]]
+
+
 PAGES = (
     Page("capacity", capacity, ("capacity.md", "capacity.svg", "data/capacity.csv")),
     Page("front", front, ("front.md", "front.svg", "data/front.csv")),
@@ -170,6 +176,7 @@ PAGES = (
     Page("joining", joining, ("joining.md",)),
     Page("estimate", estimate, ("estimate.md",)),
     Page("real_nets", real_nets, ("real_nets.md", REAL_NETS)),
+    Page("throughput", throughput, ("throughput.md", "data/throughput.csv")),
     Page("behaviors", behaviors, ("behaviors.md",)),
     Page(
         "prediction",

@@ -103,9 +103,10 @@ vehicles are AVs. The lawful car's agent always asks for more speed, at phi 45.
 ## Conditions
 
 Each network is driven as it stands, for {longest:.0f} s at most, without driver errors. Its human
-drivers are its own. Seeds are from 300,000. An AV is stuck that stands for a minute without a reason
-([figures](../reference/figures.md)). One seed is no evidence. Rows: [{data}]({data}). To go on:
-`python -m benchmarks.throughput`; your own network: `--config FILE.sumocfg --out FOLDER`.
+drivers are its own. Seeds are from 300,000; one seed is no evidence. An AV is stuck that stands for
+a minute without a reason ([figures](../reference/figures.md)). Rows: [{data}]({data}).
+
+`python -m benchmarks.throughput` goes on; your own network: `--config FILE.sumocfg --out FOLDER`.
 """
 
 

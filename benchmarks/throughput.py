@@ -104,7 +104,8 @@ vehicles are AVs. The lawful car's agent always asks for more speed, at phi 45.
 
 Each network is driven as it stands, for {longest:.0f} s at most, without driver errors. Its human
 drivers are its own. Seeds are from 300,000; one seed is no evidence. An AV is stuck that stands for
-a minute without a reason ([figures](../reference/figures.md)). Rows: [{data}]({data}).
+a minute without a reason ([figures](../reference/figures.md)). Rows:
+[{data}]({data}).
 
 `python -m benchmarks.throughput` goes on; your own network: `--config FILE.sumocfg --out FOLDER`.
 """

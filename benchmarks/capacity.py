@@ -19,13 +19,14 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean, stdev
-from typing import NamedTuple, get_type_hints
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from benchmarks import published_capacity
+from benchmarks.drives import read
 from benchmarks.tables import markdown_row
 from cosim.scenario import Scenario, load
 from cosim.scenario.vet import vetted
@@ -227,15 +228,6 @@ def measure(rows: list[Minute], names: Sequence[str], seeds: range, data: Path) 
 # ---- what is written ----
 
 
-def read(file: Path) -> list[Minute]:
-    """The rows of earlier calls; empty without a file."""
-    if not file.is_file():
-        return []
-    with file.open(encoding="utf-8", newline="") as lines:
-        kinds = get_type_hints(Minute)
-        return [Minute(**{k: kinds[k](v) for k, v in row.items()}) for row in csv.DictReader(lines)]
-
-
 def write(file: Path, rows: Sequence[Minute]) -> None:
     """Write the rows to a CSV file."""
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -349,7 +341,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=RESULTS, metavar="FOLDER")
     args = parser.parse_args(arguments)
     data = args.out / DATA
-    rows, seeds = read(data), range(*map(int, args.seeds.split(":")))
+    rows, seeds = read(Minute, data), range(*map(int, args.seeds.split(":")))
     if args.again:
         rows = [row for row in rows if row.road not in args.roads]
     measure(rows, args.roads, seeds, data)

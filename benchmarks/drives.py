@@ -7,7 +7,7 @@ import importlib
 import math
 import multiprocessing
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, get_type_hints
@@ -16,9 +16,8 @@ from cosim.batch.episode_runner import EpisodeRunner
 from cosim.files import write_csv
 from cosim.scenario.options import EpisodeOptions
 
-Row = TypeVar(
-    "Row", bound=tuple[Any, ...]
-)  # a NamedTuple: the key of its case, then columns of an episode's row
+# a NamedTuple: the key of a case, then numbers of its episode (nan: NA)
+Row = TypeVar("Row", bound=tuple[Any, ...])
 
 
 class Case(NamedTuple):
@@ -44,7 +43,9 @@ def drive(case: Case, columns: Sequence[str]) -> tuple[Any, ...]:
 
 
 def measure(kind: type[Row], cases: Sequence[Case], workers: int, file: Path, again: bool) -> list[Row]:
-    """All rows of `file`, in the order of the cases, after those that it lacks have been driven.
+    """All rows of `file`, in the order of the cases, after the missing cases have been driven.
+
+    The key does not hold options that are equal for all cases: a file is of one set of options.
 
     Args:
         kind: a NamedTuple of the row.
@@ -78,7 +79,7 @@ def read(kind: type[Row], file: Path) -> list[Row]:
         return [kind(*(types[k](v or "nan") for k, v in row.items())) for row in csv.DictReader(lines)]
 
 
-def write(file: Path, columns: Sequence[str] | Mapping[str, Any], rows: Sequence[tuple[Any, ...]]) -> None:
+def write(file: Path, columns: Iterable[str], rows: Sequence[tuple[Any, ...]]) -> None:
     """Keep the rows."""
     file.parent.mkdir(parents=True, exist_ok=True)
     write_csv(file, [dict(zip(columns, row, strict=True)) for row in rows])

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -105,14 +106,21 @@ class Point(NamedTuple):
         return fmean(self.delays)
 
 
+def paired(rows: Sequence[Drive]) -> dict[str, list[Drive]]:
+    """Habit -> its drives of all seeds that the car drove on every road, under both errors."""
+    roads = {row.road for row in rows}
+    drives = Counter(row.seed for row in rows if row.habit == CAR)
+    seeds = {seed for seed, count in drives.items() if count == len(roads) * len(ERRORS)}
+    found = {habit: [row for row in rows if row.habit == habit and row.seed in seeds] for habit in HABITS}
+    return {habit: of for habit, of in found.items() if of and len(of) == len(found[CAR])}
+
+
 def points(rows: Sequence[Drive]) -> Iterator[Point]:
-    """Habit by habit, those driven on every road under both errors."""
+    """Habit by habit, of paired drives."""
     roads = list(dict.fromkeys(row.road for row in rows))
-    for habit in HABITS:
-        calm, stress = ([row for row in rows if (row.habit, row.errors) == (habit, e)] for e in ERRORS)
+    for habit, of in paired(rows).items():
+        calm, stress = ([row for row in of if row.errors == errors] for errors in ERRORS)
         late = [[row.total_delay_s for row in calm if row.road == road] for road in roads]
-        if not all(late) or not stress:
-            continue
         hits, km = ([getattr(row, c) for row in stress] for c in ("av_involved_collisions", "av_km"))
         hit = pooled_rate(hits, [one / PER for one in km]) if sum(km) > 0.0 else Rate(*[math.nan] * 3)
         driven = sum(row.av_km for row in calm)
@@ -126,7 +134,8 @@ def points(rows: Sequence[Drive]) -> Iterator[Point]:
 
 def page(rows: Sequence[Drive]) -> list[str]:
     """The page."""
-    roads, seeds = dict.fromkeys(row.road for row in rows), sorted({row.seed for row in rows})
+    roads = dict.fromkeys(row.road for row in rows)
+    seeds = sorted({row.seed for row in paired(rows).get(CAR, ())})
     columns = [*(f"`open/{road}`, s" for road in roads), "collisions", "caused by AVs", "hard brakings"]
     found = list(points(rows))
     table = [["", *columns], *([one.habit, *_cells(one)] for one in found)]
@@ -135,8 +144,7 @@ def page(rows: Sequence[Drive]) -> list[str]:
         table="\n".join([lines[0], "|---" * (len(columns) + 1) + "|", *lines[1:]]),
         picture=PICTURE,
         seeds=", ".join(map(str, seeds)),
-        first=seeds[0],
-        end=seeds[-1] + 1,
+        span=f"{seeds[0]}:{seeds[-1] + 1}" if seeds else "A:B",
         data=DATA,
     ).splitlines()
 
@@ -190,7 +198,7 @@ Validation seeds: {seeds}. Each delay is a mean over them. One seed scatters by 
 differences of delay say nothing. Rows: [{data}]({data}).
 
 ```
-python -m benchmarks.front --seeds {first}:{end}
+python -m benchmarks.front --seeds {span}
 ```
 """
 
@@ -204,7 +212,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", default=f"{first + 20}:{first + 24}", metavar="A:B")
     parser.add_argument("--roads", nargs="*", default=ROADS, metavar="NAME")
     parser.add_argument("--habits", nargs="*", default=[*HABITS], choices=[*HABITS], metavar="NAME")
-    parser.add_argument("--duration", type=float, metavar="S", help="of a drive; default: to its end")
+    parser.add_argument(
+        "--duration",
+        type=float,
+        metavar="S",
+        help="of each drive, for a folder of its own; default: to the end",
+    )
     parser.add_argument("--workers", type=int, default=2, metavar="N")
     parser.add_argument("--again", action="store_true", help="also what is measured")
     parser.add_argument("--out", type=Path, default=RESULTS, metavar="FOLDER")

@@ -11,8 +11,10 @@ page is made of them. Needs `pip install cosim-sumo[tools]`.
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any, NamedTuple
 
 from benchmarks.drives import Case, measure
@@ -57,31 +59,40 @@ def cases(configs: Sequence[Path], seeds: range, every: bool, duration: float) -
                 yield Case((config.stem, driver, seed), wanted)
 
 
-def page(rows: Sequence[Drive]) -> list[str]:
-    """The page."""
-    others = [driver for driver in DRIVERS if driver != NONE]
-    columns = ["network", "seeds", "arrivals without AVs", *others, f"{CAR}: AVs stuck", "collisions, caused"]
+def page(rows: Sequence[Drive], duration: float) -> list[str]:
+    """The page; `duration`: s of each drive."""
+    columns = ["network", "seeds", "driver", "arrivals", "change", "delay of everybody, s", "AVs stuck"]
+    columns += ["collisions with an AV", "caused by AVs"]
     lines = [markdown_row(columns), "|---" * len(columns) + "|"]
+    networks: list[str] = []
     for network in dict.fromkeys(row.network for row in rows):
         of = {(row.driver, row.seed): row for row in rows if row.network == network}
         seeds = [seed for driver, seed in of if driver == NONE and all((d, seed) in of for d in DRIVERS)]
         if not seeds:
             continue
-        arrived = {driver: [of[driver, seed].arrivals for seed in seeds] for driver in DRIVERS}
-        cars = [of[CAR, seed] for seed in seeds]
-        hits, caused = (
-            sum(getattr(row, f"av_{c}_collisions") for row in cars) for c in ("involved", "caused")
-        )
-        lines.append(
-            markdown_row(
-                [
-                    *(network, str(len(seeds)), f"{sum(arrived[NONE]) / len(seeds):,.0f}"),
-                    *(_change(arrived[NONE], arrived[driver]) for driver in others),
-                    *(f"{sum(row.avs_stuck for row in cars):.0f}", f"{hits:.0f}, {caused:.0f}"),
-                ]
-            )
-        )
-    return WORDS.format(table="\n".join(lines), longest=LONGEST, data=DATA).splitlines()
+        networks.append(network)
+        before = [of[NONE, seed].arrivals for seed in seeds]
+        for driver in DRIVERS:
+            drives = [of[driver, seed] for seed in seeds]
+            lines.append(markdown_row([network, str(len(seeds)), driver, *_cells(before, drives)]))
+    return WORDS.format(
+        table="\n".join(lines), longest=duration, nets=" ".join(networks), data=DATA
+    ).splitlines()
+
+
+def _cells(before: Sequence[float], drives: Sequence[Drive]) -> list[str]:
+    """One driver's on one network; `before`: arrivals without AVs, seed by seed."""
+    arrived = [one.arrivals for one in drives]
+    counts = (
+        sum(getattr(one, name) for one in drives)
+        for name in ("avs_stuck", "av_involved_collisions", "av_caused_collisions")
+    )
+    return [
+        f"{fmean(arrived):,.0f}",
+        "" if drives[0].driver == NONE else _change(before, arrived),
+        f"{fmean(one.total_delay_s for one in drives):.0f}",
+        *("" if math.isnan(count) or drives[0].driver == NONE else f"{count:.0f}" for count in counts),
+    ]
 
 
 def _change(before: Sequence[float], after: Sequence[float]) -> str:
@@ -95,19 +106,24 @@ def _change(before: Sequence[float], after: Sequence[float]) -> str:
 
 WORDS = """# Do AVs choke networks of other authors?
 
-Arrivals beside the same demand without AVs, with 95 % intervals over paired seeds. 20 % of the
-vehicles are AVs. The lawful car's agent always asks for more speed, at phi 45.
+Arrivals beside the same demand without AVs, with 95 % intervals over paired seeds. Fewer than five
+seeds resolve nothing and have no interval. 20 % of the vehicles are AVs. The lawful car's agent
+always asks for more speed, at phi 45.
 
 {table}
 
 ## Conditions
 
-Each network is driven as it stands, for {longest:.0f} s at most, without driver errors. Its human
-drivers are its own. Seeds are from 300,000; one seed is no evidence. An AV is stuck that stands for
-a minute without a reason ([figures](../reference/figures.md)). Rows:
+Each network is driven as it stands, for {longest:.0f} s at most, without driver errors. Sensing is
+`ideal`. Its human drivers are its own. Seeds are from 300,000. An AV is stuck that stands for a
+minute without a reason ([figures](../reference/figures.md)). Rows:
 [{data}]({data}).
 
-`python -m benchmarks.throughput` goes on; your own network: `--config FILE.sumocfg --out FOLDER`.
+```
+python -m benchmarks.throughput --nets {nets}
+```
+
+Your own network: `--config FILE.sumocfg --out FOLDER`.
 """
 
 
@@ -119,7 +135,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", default=f"{FIRST}:{FIRST + SEEDS}", metavar="A:B")
     parser.add_argument("--nets", nargs="+", default=NETS, metavar="NAME")
     parser.add_argument("--config", nargs="+", type=Path, metavar="FILE")
-    parser.add_argument("--duration", type=float, default=LONGEST, metavar="S")
+    parser.add_argument(
+        "--duration", type=float, default=LONGEST, metavar="S", help="for a folder of its own"
+    )
     parser.add_argument("--workers", type=int, default=2, metavar="N")
     parser.add_argument("--again", action="store_true", help="also what is measured")
     parser.add_argument("--out", type=Path, default=RESULTS, metavar="FOLDER")
@@ -127,7 +145,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     configs = args.config or [a10kw().with_name(f"{name}.sumocfg") for name in args.nets]
     wanted = list(cases(configs, range(*map(int, args.seeds.split(":"))), bool(args.config), args.duration))
     rows = measure(Drive, wanted, args.workers, args.out / DATA, args.again)
-    write_page(args.out / PAGE, page(rows))
+    write_page(args.out / PAGE, page(rows, args.duration))
     print(args.out / PAGE)
 
 

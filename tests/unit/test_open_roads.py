@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 import pytest
 
 import sumo_scenarios
-from benchmarks import capacity, published_capacity
+from benchmarks import capacity, drives, published_capacity
 from cosim.errors import BadInput
 from cosim.scenario import load
 from cosim.types import OnCollision
@@ -98,7 +98,7 @@ def test_a_breakdown_lasts_and_capacity_is_the_largest_flow_before_it() -> None:
 def test_rows_are_kept_as_they_are(tmp_path: Path) -> None:
     rows = [capacity.Minute("minor", "over", 100_000, 3, 1200.0, 960.0, 12.25, 4.5, 2)]
     capacity.write(tmp_path / "rows.csv", rows)
-    assert capacity.read(tmp_path / "rows.csv") == rows
+    assert drives.read(capacity.Minute, tmp_path / "rows.csv") == rows
 
 
 def test_published_formulas_give_their_tabulated_values() -> None:

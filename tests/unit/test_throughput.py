@@ -23,8 +23,9 @@ def test_a_network_is_shown_where_all_drivers_drove_it_and_with_an_interval_of_f
         for driver, share in shares.items()
     ]
     rows.append(throughput.Drive("grid6", throughput.NONE, 0, 100, 1.0, 0, 0, 0))
-    text = "\n".join(throughput.page(rows))
-    assert "| A10KW | 6 | 1,002 | -10.0 % (" in text
+    text = "\n".join(throughput.page(rows, 900.0))
+    assert "| A10KW | 6 | no AVs | 1,002 |  | 40 |  |  |  |" in text
+    assert "| A10KW | 6 | `idm` | 902 | -10.0 % (" in text
     assert "| +10.0 % (" in text
-    assert "| 6 | 12, 6 |" in text
+    assert ") | 40 | 6 | 12 | 6 |" in text
     assert "grid6" not in text

@@ -44,11 +44,9 @@ class Waves:
 
     def hide(self, av: str, unknown: Collection[str]) -> None:
         """Make SUMO's driver of `av` ignore vehicles that are unknown to the AV."""
-        if unknown or av in self._unknown:
+        if tuple(unknown) != self._unknown.get(av, ()):
             self._unknown[av] = tuple(unknown)
             self._write_foes(av)
-            if not unknown:
-                del self._unknown[av]
 
     def ignore_leaders(self, av: str, leaders: Collection[str]) -> None:
         """Make SUMO's driver of `av` ignore `leaders`, which the AV follows itself, and unknown vehicles."""

@@ -161,7 +161,7 @@ def test_a_class_a_factory_and_a_function_of_ones_own_drive(code: Path, tmp_path
         ("Filed", "Filed.files='nowhere.zip': no such file"),
         ("Numbered", "Numbered.av_parameters=('lcSpeedGain', 3): must map SUMO's parameters to text"),
         ("Leaves", "decide: SystemExit: 3"),
-        ("UnknownVehicle", "decide: decided for one that is no AV on the road: 'nobody'"),
+        ("UnknownVehicle", "decide: decided for an id that is no AV on the road: 'nobody'"),
         ("Lists", "decide='list': must return a mapping of AV to decision"),
         ("Blind", "Blind.observation: must be a cosim.types.ObservationConfig"),
         ("Fails", "Fails: OSError: no model file"),

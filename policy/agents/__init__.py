@@ -46,6 +46,7 @@ POLICIES: dict[str, Callable[[], Policy]] = {
     "car-alone": partial(_made, "car_alone", "CarAlone"),
     "random": partial(_made, "random", "Random"),
     "altruist-rule": partial(_made, "altruist_rule", "AltruistRule"),
+    "yield-rule": partial(_made, "yield_rule", "YieldRule"),
     **{name: partial(_made, "prediction_aware", "PredictionAware", name) for name in APPROACHES},
     "vfn-p-oracle": partial(_made, "oracle", "Oracle", "vfn-p"),  # predicts from counterfactual rollouts
 }

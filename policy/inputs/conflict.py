@@ -49,9 +49,9 @@ def find_conflict(road: RoadMap, history: History, seen: Seen) -> Conflict | Non
         return None
     theirs = road.path(seen.lane)
     place = seen.lane_position * theirs.scale  # m, the mission vehicle's front bumper
-    beside = _beside(road, own, theirs)
-    if beside is not None:
-        mine, other, right = beside
+    adjacent = beside(road, own, theirs)
+    if adjacent is not None:
+        mine, other, right = adjacent
         return Conflict((mine - history.route.arc) - (other - place), False, right, seen.speed)
     if not (np.isfinite(own.conflict) and _crosses_junction(road, theirs)):
         return None  # no conflict: the ego's lane is adjacent to the mission vehicle's target lane
@@ -96,7 +96,7 @@ def _same_approach(road: RoadMap, own: LanePath, theirs: LanePath) -> bool:
     return road.lanes[theirs.lanes[0]].edge in edges
 
 
-def _beside(road: RoadMap, own: LanePath, theirs: LanePath) -> tuple[float, float, bool] | None:
+def beside(road: RoadMap, own: LanePath, theirs: LanePath) -> tuple[float, float, bool] | None:
     """Where the other lane becomes adjacent: arc on the own path, arc on the other, whether on the right."""
     place = {lane: float(start) for lane, start in zip(own.lanes, own.lane_start, strict=True)}
     for lane, start in zip(theirs.lanes, theirs.lane_start, strict=True):

@@ -1,0 +1,68 @@
+"""A scripted rule that yields to whoever needs it, on any road, without a mark on any vehicle.
+
+It is the baseline of the learned altruist: whatever learning is worth must show beside it.
+"""
+
+from collections.abc import Mapping
+
+from cosim.control import APPROACH_DECEL
+from cosim.types import Decision, History, MetaAction, ObservationConfig, PolicyContext
+from policy.agents.idm import Idm
+from policy.inputs.needs import Need, Needs
+
+# When an AV yields and how much, chosen on validation roads (research/yielding.py)
+REACH = 150.0  # m before the end of its lane, within which a merging vehicle is helped
+GAPS = 2.0, 40.0  # m to its rear, at least and at most: an AV nearer would stand beside it
+MAX_BETWEEN = 0  # vehicles between both
+EASE = 4.0  # m/s below its speed
+PATIENCE = 5.0  # s that a vehicle has waited at its line before an AV with priority yields
+ARRIVAL = 8.0  # s until the AV's own arrival at the line, at least
+HOLD, REST = 8.0, 6.0  # s of yielding at most, and then without it
+
+
+class YieldRule(Idm):
+    """Accelerates, but eases off behind a vehicle that must merge and before one that has long waited."""
+
+    name = "yield-rule"
+    observation = ObservationConfig(maps=False, rows=32)
+
+    def reset(self, context: PolicyContext) -> None:
+        """Start an episode: nobody has yielded yet."""
+        super().reset(context)
+        self._needs = Needs(context)
+        self._began: dict[tuple[str, str], float] = {}  # (AV, vehicle) -> s, the begin of yielding
+        self._rests: dict[str, float] = {}  # AV -> s, until then it does not begin to yield
+
+    def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
+        """Accelerate, or the acceleration towards the lowest speed that any need asks for."""
+        needs = self._needs.find(histories)
+        return {av: self._decision(history, needs.get(av, [])) for av, history in histories.items()}
+
+    def _decision(self, history: History, needs: list[Need]) -> Decision:
+        speeds = [self._speed(history, need) for need in needs if self._yields(history, need)]
+        wanted = min(speeds, default=float("inf"))
+        if wanted > history.ego_speed + EASE:
+            return Decision(MetaAction.ACCELERATE)
+        return Decision(MetaAction.IDLE, accel=wanted - history.ego_speed)
+
+    def _yields(self, history: History, need: Need) -> bool:
+        """Whether the need is this AV's to serve, now, and not for too long."""
+        av, now = history.ids[0], history.time
+        if need.crossing:
+            can_slow = history.ego_speed**2 < 2.0 * APPROACH_DECEL * need.gap
+            fits = can_slow and need.waited >= PATIENCE
+        else:
+            fits = need.remaining < REACH and need.between <= MAX_BETWEEN and GAPS[0] <= need.gap <= GAPS[1]
+        began = self._began.get((av, need.vehicle))
+        if not fits or (began is None and now < self._rests.get(av, 0.0)):
+            return False
+        began = self._began.setdefault((av, need.vehicle), now)
+        if now - began > HOLD:
+            self._rests[av] = now + REST
+            del self._began[av, need.vehicle]
+            return False
+        return True
+
+    def _speed(self, history: History, need: Need) -> float:
+        """m/s"""
+        return need.gap / ARRIVAL if need.crossing else max(need.speed - EASE, 0.0)

@@ -1,0 +1,145 @@
+"""Who needs something of an AV: vehicles whose lane ends beside it, and vehicles that wait for it at a line.
+
+No label: each need follows from the road map and from the vehicles that the AV knows of, on any network.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from cosim.road import LanePath, RoadMap
+from cosim.types import LENGTH, SPEED, History, PolicyContext
+from policy.inputs.conflict import along, beside
+
+STANDING = 1.0  # m/s: a slower vehicle waits
+FORGET = 2.0  # s of waiting forgotten in a second of driving
+LINE_RANGE = 12.0  # m before its line, within which a vehicle waits for those with priority
+AHEAD_RANGE = 300.0  # m on the AV's way, within which junctions count
+
+
+class Need(NamedTuple):
+    """A vehicle's need of one AV."""
+
+    vehicle: str
+    crossing: bool  # it waits at a line where it gives way to the AV; else its lane ends beside the AV's
+    gap: float  # m from the AV's front to the vehicle's rear, or (crossing) to the AV's own line
+    between: int  # vehicles on the AV's lane inside this gap
+    speed: float  # m/s, of the vehicle
+    remaining: float  # m, left to the vehicle before the end of its lane, or its line
+    waited: float  # s (`Waiting`)
+
+
+class Waiting:
+    """The seconds that each known vehicle has stood: counted below `STANDING`, forgotten while it drives."""
+
+    def __init__(self) -> None:
+        self._waited: dict[str, float] = {}
+        self._time: dict[str, float] = {}
+
+    def update(self, vehicle: str, speed: float, time: float) -> float:
+        """s that the vehicle has waited at `time` s; a vehicle out of sight keeps its count."""
+        past = time - self._time.get(vehicle, time)
+        waited = self._waited.get(vehicle, 0.0)
+        waited = waited + past if speed < STANDING else max(waited - FORGET * past, 0.0)
+        self._time[vehicle], self._waited[vehicle] = time, waited
+        return waited
+
+
+class Needs:
+    """The needs of each AV; remembers for how long vehicles have waited.
+
+    AVs that share their perception share this memory too.
+    """
+
+    def __init__(self, context: PolicyContext) -> None:
+        self._road, self._pooled = context.road, context.pooled
+        self._waiting: dict[str, Waiting] = {}
+        self._ending = _ending_lanes(context.road)
+        self._yielding = _lanes_that_yield_to(context.road)
+
+    def find(self, histories: Mapping[str, History]) -> dict[str, list[Need]]:
+        """AV -> the needs that it can serve, nearest first; AVs without a need are left out."""
+        found = {}
+        for av, history in histories.items():
+            needs = self._of(history, self._waiting.setdefault("" if self._pooled else av, Waiting()))
+            if needs:
+                found[av] = sorted(needs, key=lambda need: need.gap)
+        return found
+
+    # ---- inside ----
+
+    def _of(self, history: History, waiting: Waiting) -> list[Need]:
+        own = history.route.paths[1]
+        if own is None:
+            return []
+        standing = self._lines_ahead(history, own)
+        needs = []
+        for row in np.flatnonzero(history.valid[-1] & (history.lane >= 0)).tolist()[1:]:
+            lane, speed = int(history.lane[row]), float(history.kinematics[-1, row, SPEED])
+            waited = waiting.update(history.ids[row], speed, history.time)
+            if lane in self._ending:
+                need = self._merging(history, own, row, waited)
+            elif lane in standing:
+                need = self._waits(history, row, waited, standing[lane])
+            else:
+                need = None
+            if need is not None:
+                needs.append(need)
+        return needs
+
+    def _merging(self, history: History, own: LanePath, row: int, waited: float) -> Need | None:
+        """The need of a vehicle on a lane that ends, if that lane lies beside the AV's."""
+        lane = int(history.lane[row])
+        theirs = self._road.path(lane)
+        meet = beside(self._road, own, theirs)
+        if meet is None:
+            return None
+        mine, other, _ = meet
+        newest = history.kinematics[-1, row]
+        place = float(history.lane_position[row]) * theirs.scale  # m, front bumper
+        half = 0.5 * float(history.kinematics[-1, 0, LENGTH])  # m, of the AV
+        gap = (mine - history.route.arc - half) - (other - place) - float(newest[LENGTH])
+        ahead = along(history, own)[:, 0]
+        between = int(((ahead > 0.0) & (ahead < gap + half)).sum())
+        left = theirs.length - place
+        return Need(history.ids[row], False, gap, between, float(newest[SPEED]), left, waited)
+
+    def _waits(self, history: History, row: int, waited: float, line: float) -> Need | None:
+        """The need of a vehicle that gives way to the AV, `line` m before the AV's line."""
+        remaining = self._road.lanes[int(history.lane[row])].length - float(history.lane_position[row])
+        if remaining > LINE_RANGE:
+            return None
+        speed = float(history.kinematics[-1, row, SPEED])
+        return Need(history.ids[row], True, line, 0, speed, remaining, waited)
+
+    def _lines_ahead(self, history: History, own: LanePath) -> dict[int, float]:
+        """Lanes whose vehicles give way to this AV -> m to the AV's line there."""
+        front = history.route.arc + 0.5 * float(history.kinematics[-1, 0, LENGTH])
+        found: dict[int, float] = {}
+        for lane, following, start in zip(
+            own.lanes, own.lanes[1:], own.lane_start[1:].tolist(), strict=False
+        ):
+            line = start - front
+            if line > AHEAD_RANGE:
+                break
+            link = self._road.link_of.get((lane, following))
+            if link is not None and line > 0.0:
+                for origin in self._yielding.get(link, ()):
+                    found.setdefault(origin, line)
+        return found
+
+
+def _ending_lanes(road: RoadMap) -> frozenset[int]:
+    """Lanes that end although the road goes on beside them, within the horizon of `RoadMap.path`."""
+    return frozenset(k for k in range(len(road.lanes)) if road.path(k).dead_end)
+
+
+def _lanes_that_yield_to(road: RoadMap) -> dict[int, frozenset[int]]:
+    """Link -> the lanes from which links without a signal give way to it."""
+    found: dict[int, set[int]] = {}
+    for link in road.links:
+        if link.signal < 0:
+            for foe in link.foes:
+                found.setdefault(foe, set()).add(link.origin)
+    return {foe: frozenset(lanes) for foe, lanes in found.items()}

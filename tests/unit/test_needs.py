@@ -1,0 +1,114 @@
+"""Who needs something of an AV follows from the road and from what the AV knows; the yield rule serves it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from policy_scenes import LANE_WIDTH, Car, histories, straight_road
+
+from cosim.road import Lane, Link, RoadMap, Rule
+from cosim.types import COMPACT, History, MetaAction, PolicyContext, Timing
+from policy.agents.yield_rule import EASE, HOLD, PATIENCE, YieldRule
+from policy.inputs.needs import Need, Needs
+
+ENDS = straight_road(dead_end=0)  # the right lane ends at x = 400
+AV = Car("av", 300.0, 1, 20.0, is_av=True)
+
+
+def context(road: RoadMap) -> PolicyContext:
+    return PolicyContext(road, Timing(), COMPACT, 0.0, np.random.default_rng(0))
+
+
+def needs(road: RoadMap, *cars: Car) -> list[Need]:
+    return Needs(context(road)).find(histories(road, cars)).get("av", [])
+
+
+def test_a_vehicle_whose_lane_ends_beside_it_needs_the_av() -> None:
+    (need,) = needs(ENDS, AV, Car("ends", 320.0, 0, 15.0))
+    assert need == Need(
+        "ends", False, pytest.approx(15.0), 0, 15.0, pytest.approx(77.5), waited=0.0
+    )  # 20 m of centres, less two halves of 5 m; its front is at 322.5
+
+
+def test_nobody_needs_it_where_no_lane_ends() -> None:
+    assert needs(straight_road(), AV, Car("other", 320.0, 0, 15.0)) == []
+
+
+def test_nobody_two_lanes_away_needs_it() -> None:
+    assert needs(ENDS, Car("av", 300.0, 2, 20.0, is_av=True), Car("ends", 320.0, 0, 15.0)) == []
+
+
+def test_vehicles_between_both_are_counted() -> None:
+    ahead = Car("between", 310.0, 1, 20.0)
+    beyond = Car("beyond", 330.0, 1, 20.0)
+    (need,) = needs(ENDS, AV, Car("ends", 320.0, 0, 15.0), ahead, beyond)
+    assert need.between == 1
+
+
+def crossing_road(rule: Rule) -> RoadMap:
+    """A street to the east whose line is at x = 400, and a lane from the south that ends there."""
+
+    def lane(name: str, a: tuple[float, float], b: tuple[float, float], *successors: int) -> Lane:
+        length = float(np.hypot(b[0] - a[0], b[1] - a[1]))
+        return Lane(name, name[0], 0, np.array([a, b]), length, LANE_WIDTH, 25.0, successors)
+
+    lanes = (
+        lane("a_0", (0.0, 0.0), (400.0, 0.0), 1),
+        lane("b_0", (400.0, 0.0), (900.0, 0.0)),
+        lane("c_0", (400.0, -200.0), (400.0, -4.0), 1),
+    )
+    street = Link(0, -1, 1, -1, Rule.PRIORITY)
+    return RoadMap(lanes, links=(street, Link(2, -1, 1, -1, rule, foes=(0,) if rule == Rule.YIELD else ())))
+
+
+def at_line(road: RoadMap, time: float) -> dict[str, History]:
+    """The AV, and a car that stands 2 m before its line."""
+    scene = histories(road, [Car("av", 200.0, 0, 15.0, is_av=True), Car("waits", 191.5, 0, 0.0)])
+    lane = scene["av"].lane.copy()
+    lane[1] = 2
+    return {"av": scene["av"]._replace(lane=lane, time=time)}
+
+
+def test_a_vehicle_that_gives_way_to_the_av_needs_it_the_more_the_longer_it_has_waited() -> None:
+    road = crossing_road(Rule.YIELD)
+    of = Needs(context(road))
+    assert of.find(at_line(road, 0.0))["av"][0].waited == 0.0
+    (need,) = of.find(at_line(road, 3.0))["av"]
+    assert need == Need(
+        "waits", True, pytest.approx(197.5), 0, 0.0, pytest.approx(2.0), waited=pytest.approx(3.0)
+    )
+
+
+def test_a_vehicle_with_priority_needs_nobody() -> None:
+    road = crossing_road(Rule.PRIORITY)
+    assert Needs(context(road)).find(at_line(road, 0.0)) == {}
+
+
+# ---- the rule ----
+
+
+def test_the_rule_eases_off_behind_it_until_it_has_had_its_time() -> None:
+    rule = YieldRule()
+    rule.reset(context(ENDS))
+    scene = histories(ENDS, [AV, Car("ends", 320.0, 0, 15.0)])
+    decision = rule.decide(scene)["av"]
+    assert decision.accel == pytest.approx(15.0 - EASE - 20.0)
+    later = {"av": scene["av"]._replace(time=HOLD + 0.1)}
+    assert rule.decide(later)["av"].action == MetaAction.ACCELERATE
+    assert rule.decide(later)["av"].accel is None
+
+
+def test_the_rule_accelerates_beside_nobody_in_need() -> None:
+    rule = YieldRule()
+    rule.reset(context(ENDS))
+    assert rule.decide(histories(ENDS, [AV]))["av"].accel is None
+
+
+def test_the_rule_arrives_later_for_one_that_has_waited_long() -> None:
+    road = crossing_road(Rule.YIELD)
+    rule = YieldRule()
+    rule.reset(context(road))
+    assert rule.decide(at_line(road, 0.0))["av"].accel is None
+    near = at_line(road, PATIENCE)["av"]
+    close = near._replace(route=near.route._replace(arc=340.0))
+    assert rule.decide({"av": close})["av"].accel == pytest.approx((400.0 - 342.5) / 8.0 - 15.0)

@@ -152,8 +152,14 @@ def capacity(place: Place) -> list[list[str]]:
 
 def front(place: Place) -> list[list[str]]:
     """Costs and benefits of each habit of the lawful car."""
-    few = ["--roads", "lane_drop", "--seeds", "100000:100001", "--duration", "30"] if place.small else []
+    few = ["--roads", "1", "--duration", "30"] if place.small else []
     return [["benchmarks.front", *few, "--out", str(place.out)]]
+
+
+def yielding(place: Place) -> list[list[str]]:
+    """Scripted yielding beside the lawful car."""
+    few = ["--roads", "1", "--rules", "as it ships", "--duration", "30"] if place.small else []
+    return [["benchmarks.yielding", *few, "--out", str(place.out)]]
 
 
 def throughput(place: Place) -> list[list[str]]:
@@ -165,6 +171,7 @@ def throughput(place: Place) -> list[list[str]]:
 PAGES = (
     Page("capacity", capacity, ("capacity.md", "capacity.svg", "data/capacity.csv")),
     Page("front", front, ("front.md", "front.svg", "data/front.csv")),
+    Page("yielding", yielding, ("yielding.md", "data/yielding.csv")),
     Page("law", law, ("law.md",)),
     Page("agent", agent, ("agent.md",)),
     Page("prediction_speed", prediction_speed, ("prediction_speed.md",)),

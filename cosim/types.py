@@ -277,6 +277,9 @@ class Snapshot:
     switches: Floats = field(default_factory=lambda: np.zeros(0))
     # [n] s lost since departure against free flow (SUMO's timeLoss); nan if unknown, as in recordings
     time_loss: Floats = field(default_factory=lambda: np.zeros(0))
+    # [n] turn indicator: +1 left, -1 right, 0 off or unknown. SUMO's drivers set it as long as they want to
+    # change lanes or turn
+    indicator: npt.NDArray[np.int8] = field(default_factory=lambda: np.zeros(0, np.int8))
     # [n] g/s of CO2 at this moment, by SUMO's emission model; nan if unknown, as in recordings
     co2: Floats = field(default_factory=lambda: np.zeros(0))
     waiting: Mapping[str, Due] | None = None  # vehicles waiting for insertion; None: unknown
@@ -291,6 +294,8 @@ class Snapshot:
             object.__setattr__(self, "actor", actor)
         if len(self.place) != len(self.lane):
             object.__setattr__(self, "place", self.lane)
+        if len(self.indicator) != len(self.kind):
+            object.__setattr__(self, "indicator", np.zeros(len(self.kind), np.int8))
         for name in ("time_loss", "co2"):
             if len(getattr(self, name)) != len(self.kind):
                 object.__setattr__(self, name, np.full(len(self.kind), np.nan))
@@ -437,6 +442,7 @@ class History(NamedTuple):
     signals: Bytes = NO_SIGNALS  # [s] `Snapshot.signals`, for drawing predicted maps
     age: Floats = NO_AGE  # [R] s since the newest measurement of each row's vehicle; empty: all are 0
     source: npt.NDArray[np.int8] = NO_SOURCE  # [R] `Source` of that measurement; empty: all are the truth
+    indicator: npt.NDArray[np.int8] = NO_SOURCE  # [R] `Snapshot.indicator`; empty: unknown
     # the AVs whose intentions arrive in time for this decision (MCM); None: all, if intentions are shared
     hears: frozenset[str] | None = None
     decision_latency: float = 0.0  # s until this decision acts; the previous command holds until then

@@ -118,6 +118,7 @@ class Observer:
         fill_rows(past.window, past.slots, rows, fixed, kinematics, valid)
         lanes = np.where(rows >= 0, s.lane[rows], -1).astype(np.int32)  # [B,R]
         positions = np.where(rows >= 0, s.lane_position[rows], 0.0)  # [B,R] m
+        indicators = np.where(rows >= 0, s.indicator[rows], 0).astype(np.int8)  # [B,R]
         pose = np.stack([s.x, s.y, s.heading], axis=1)[egos]  # [B,3]
         no_maps = np.zeros((c.frames, len(c.channels), 0, 0), np.uint8)
         result = {}
@@ -149,6 +150,7 @@ class Observer:
                 time=s.time,
                 rules=self._rules.ahead(way, place * way.scale, now),
                 signals=s.signals,
+                indicator=indicators[b],
                 decision_latency=self._decision_latency,
             )
         return result

@@ -26,18 +26,19 @@ OUT_OF_RANGE, HIDDEN, MISSED, DETECTED = 0, 1, 2, 3
 SENSOR, CAM, CPM = 1, 2, 3
 HOLD, CONSTANT_VELOCITY, LANES, TRUTH = 0, 1, 2, 3
 # Columns of the ring of true states.
-X, Y, HEADING, SPEED, LANE, POSITION = range(6)
-STATES = 6
+X, Y, HEADING, SPEED, LANE, POSITION, INDICATOR = range(7)
+STATES = 7
 # Columns of a track: time (s, nan: none), x, y (m), velocity (m/s), heading (rad), variance of a coordinate,
 # its covariance with speed, variances of speed and heading; last accepted measurement (s), lane, front bumper
-# on it (m), source, detections, acceleration (m/s2), time of the newest CAM (s), whether a CAM was received.
+# on it (m), source, detections, acceleration (m/s2), time of the newest CAM (s), whether a CAM was received,
+# turn indicator.
 T_TIME, T_X, T_Y, T_VX, T_VY, T_HEADING, T_XX, T_XV, T_VV, T_HH, T_ACCEPTED, T_LANE, T_POSITION = range(13)
-T_SOURCE, T_HITS, T_ACCEL, T_CAM, T_TOLD = range(13, 18)
-TRACK = 18
+T_SOURCE, T_HITS, T_ACCEL, T_CAM, T_TOLD, T_INDICATOR = range(13, 19)
+TRACK = 19
 # Columns of a belief: an object's present state as estimated by an AV, its age (s), source (`OWN`: the AV
-# itself) and whether a CAM was received.
-B_X, B_Y, B_HEADING, B_SPEED, B_ACCEL, B_LANE, B_POSITION, B_AGE, B_SOURCE, B_TOLD = range(10)
-BELIEF = 10
+# itself), whether a CAM was received, and its turn indicator.
+B_X, B_Y, B_HEADING, B_SPEED, B_ACCEL, B_LANE, B_POSITION, B_AGE, B_SOURCE, B_TOLD, B_INDICATOR = range(11)
+BELIEF = 11
 OWN = -1.0
 
 BINS = 720  # number of directions of the line of sight, half a degree each
@@ -227,7 +228,7 @@ def _behind_walls(walls: Outlines, x0: float, y0: float, reach: float, depth: Fl
 
 @compiled
 def detect(
-    state: Floats,  # [S,6] true states, x nan where absent
+    state: Floats,  # [S,7] true states, x nan where absent
     length: Floats,  # [S] m
     width: Floats,  # [S] m
     hides: Flags,  # [S] whether the body hides objects behind it
@@ -404,7 +405,7 @@ def _between(ring: Floats, at: float, newest: int, held: int, slot: int, out: Fl
 
 @compiled
 def follow(
-    ring: Floats,  # [T,S,6]
+    ring: Floats,  # [T,S,7]
     seen: Flags,  # [T,A,S]
     found: Lists,  # [T,A,S] from `detect`; slots of objects that left are not DETECTED in `seen`
     newest: int,  # newest frame in the rings
@@ -420,7 +421,7 @@ def follow(
     contents: Flags,  # [2] CAMs enabled, CPMs enabled
     radio: Radio,
     sender_noise: Floats,  # [3]
-    tracks: Floats,  # [A,S,18] in and out
+    tracks: Floats,  # [A,S,19] in and out
     heard: Floats,  # [A,A] time of the newest CPM of each sender, in and out
 ) -> None:
     """Update every AV's tracks with the newest measurement of each object in this frame."""
@@ -520,11 +521,12 @@ def follow(
             ahead = (track[T_X] - truth[X]) * math.cos(truth[HEADING])
             ahead += (track[T_Y] - truth[Y]) * math.sin(truth[HEADING])
             track[T_LANE], track[T_POSITION] = truth[LANE], truth[POSITION] + ahead
+            track[T_INDICATOR] = truth[INDICATOR]
 
 
 @compiled
 def intentions_heard(
-    state: Floats,  # [S,6] now
+    state: Floats,  # [S,7] now
     egos: Rows,  # [A]
     streams: Streams,  # [S]
     now: float,  # s
@@ -619,7 +621,7 @@ def resample(
 
 @compiled
 def believe(
-    state: Floats,  # [S,6] now, for compensation with the truth
+    state: Floats,  # [S,7] now, for compensation with the truth
     length: Floats,  # [S] m
     egos: Rows,  # [A]
     now: float,  # s
@@ -631,10 +633,10 @@ def believe(
     scale: Floats,  # [l] m along the centre line per SUMO's m
     following: Rows,  # [l]
     lane_length: Floats,  # [l] m
-    tracks: Floats,  # [A,S,18] in and out: ended tracks are cleared
+    tracks: Floats,  # [A,S,19] in and out: ended tracks are cleared
     first: Rows,  # [A+1] out: first of the M beliefs of each AV
     slot: Rows,  # [A*S] out, the first M: slot of the object; ascending for one AV
-    beliefs: Floats,  # [A*S,10] out, the first M
+    beliefs: Floats,  # [A*S,11] out, the first M
 ) -> None:
     """Every AV's belief about the present state of all objects; its own state is exact, acceleration 0."""
     many = 0
@@ -651,6 +653,7 @@ def believe(
                 belief[B_SPEED], belief[B_LANE] = state[o, SPEED], state[o, LANE]
                 belief[B_POSITION], belief[B_ACCEL] = state[o, POSITION], 0.0
                 belief[B_AGE], belief[B_SOURCE], belief[B_TOLD] = 0.0, OWN, 1.0
+                belief[B_INDICATOR] = state[o, INDICATOR]
                 continue
             track = tracks[a, o]
             if math.isnan(track[T_TIME]):
@@ -668,7 +671,7 @@ def believe(
             speed = max(track[T_VX] * math.cos(heading) + track[T_VY] * math.sin(heading), 0.0)
             x, y, age = track[T_X], track[T_Y], now - track[T_TIME]
             belief[B_AGE], belief[B_SOURCE], belief[B_TOLD] = age, track[T_SOURCE], track[T_TOLD]
-            belief[B_ACCEL] = track[T_ACCEL]
+            belief[B_ACCEL], belief[B_INDICATOR] = track[T_ACCEL], track[T_INDICATOR]
             if compensation == TRUTH and not math.isnan(state[o, X]):
                 x, y, heading, speed = state[o, X], state[o, Y], state[o, HEADING], state[o, SPEED]
                 lane, position = int(state[o, LANE]), state[o, POSITION]
@@ -696,13 +699,13 @@ def believe(
 
 @compiled
 def arrange(
-    first: Rows,  # [A+1], [M] and [M,10] of `believe`
+    first: Rows,  # [A+1], [M] and [M,11] of `believe`
     slot: Rows,
     beliefs: Floats,
     place: Rows,  # [k] of S slots, in the wanted order
     slots: int,  # S
     rows: Rows,  # [M] out: index among the k of each belief's object
-    columns: Floats,  # [10,M] out
+    columns: Floats,  # [11,M] out
 ) -> None:
     """The beliefs of each AV in the order of `place`."""
     at = np.full(slots, -1)  # the belief about each

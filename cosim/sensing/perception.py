@@ -20,6 +20,7 @@ from cosim.sensing.kernels import (
     B_ACCEL,
     B_AGE,
     B_HEADING,
+    B_INDICATOR,
     B_LANE,
     B_POSITION,
     B_SOURCE,
@@ -94,7 +95,7 @@ class Perception:
         state, seen = slots.ring[k], slots.seen[k]
         state[:] = np.nan
         columns = snapshot.x, snapshot.y, snapshot.heading, snapshot.speed, snapshot.lane
-        state[rows] = np.stack([*columns, snapshot.lane_position], axis=1)
+        state[rows] = np.stack([*columns, snapshot.lane_position, snapshot.indicator], axis=1)
         step = round(now / self._timing.frame)
         kernels.detect(
             *(state, slots.length, slots.width, slots.hides, slots.egos, slots.streams, step, p.range),
@@ -126,12 +127,12 @@ class Perception:
     # ---- inside ----
 
     def _compensate(self, compensator: Compensator, about: Ints, beliefs: Floats, now: float) -> None:
-        """Predict all beliefs [M,10], of the slots `about` [M], to `now` (s)."""
+        """Predict all beliefs [M,11], of the slots `about` [M], to `now` (s)."""
         slots, past = self._slots, self._slots.past  # [N,A,S,5]
         then = self._own_then(beliefs)
         known = np.flatnonzero(then[:, B_SOURCE])
         owner = np.repeat(np.arange(len(slots.egos)), np.diff(slots.first))[known]
-        place, then = about[known], then[known]  # [V], [V,10]
+        place, then = about[known], then[known]  # [V], [V,11]
         past[:-1] = past[1:]
         past[-1] = np.nan
         past[-1, owner, place] = then[:, PAST]
@@ -149,7 +150,7 @@ class Perception:
         beliefs[known[late]] = then
 
     def _own_then(self, beliefs: Floats) -> Floats:
-        """`beliefs` [M,10] with each AV's own state at the mean age of its beliefs, in whole frames."""
+        """`beliefs` [M,11] with each AV's own state at the mean age of its beliefs, in whole frames."""
         ring, frame, result = self._slots.ring, self._timing.frame, beliefs.copy()
         for a, e in enumerate(self._slots.egos):
             if e < 0:
@@ -160,7 +161,7 @@ class Perception:
             age = float(all_[known, B_AGE].mean()) if known.any() else 0.0
             back = min(round(age / frame), self._held - 1)
             own = ring[(self._newest - back) % len(ring), e]
-            mine[[B_X, B_Y, B_HEADING, B_SPEED, B_LANE, B_POSITION]] = own
+            mine[[B_X, B_Y, B_HEADING, B_SPEED, B_LANE, B_POSITION, B_INDICATOR]] = own
             mine[B_AGE] = back * frame
             if math.isnan(own[0]):
                 mine[B_SOURCE] = 0.0
@@ -195,7 +196,7 @@ class Percepts(Mapping[str, Percept]):
         slots: "_Slots",
         seen: npt.NDArray[np.uint8],  # [A,S]
         about: Ints,  # [M] slots
-        beliefs: Floats,  # [M,10]
+        beliefs: Floats,  # [M,11]
         hears: npt.NDArray[np.uint8],  # [A,A]
     ) -> None:
         known = slots.known
@@ -210,6 +211,7 @@ class Percepts(Mapping[str, Percept]):
         self._kind[(self._kind == AV) & (columns[B_TOLD] == 0.0)] = HV  # unknown as an AV without a CAM
         self._length, self._width, self._mission = known.length[rows], known.width[rows], known.mission[rows]
         self._lane = columns[B_LANE].astype(np.int32)
+        self._indicator = columns[B_INDICATOR].astype(np.int8)
         self._source = np.maximum(columns[B_SOURCE], TRUTH).astype(np.int8)  # OWN is the truth
         self._unknown = np.full(len(rows), np.nan)
         self._found: dict[str, Percept] = {}
@@ -248,6 +250,7 @@ class Percepts(Mapping[str, Percept]):
             switches=truth.switches,
             time_loss=unknown,
             co2=unknown,
+            indicator=self._indicator[known],
             limits=truth.limits,
         )
         heard = self._hears[a].nonzero()[0]
@@ -256,7 +259,7 @@ class Percepts(Mapping[str, Percept]):
 
 
 def _tracks(slots: "_Slots", owner: Ints, place: Ints, then: Floats, frame: float) -> Tracks:
-    """The beliefs `then` [V,10] of AVs and objects [V], with their past, `frame` s apart."""
+    """The beliefs `then` [V,11] of AVs and objects [V], with their past, `frame` s apart."""
     past = slots.past[:, owner, place].swapaxes(0, 1)  # [V,N,5]
     state = np.empty((*past.shape[:2], len(STATE)))
     turn = past[..., 1 + HEADING] - past[:, -1:, 1 + HEADING]
@@ -392,7 +395,7 @@ class _Slots:
 
 
 def _no_tracks(avs: int, objects: int) -> Floats:
-    """[A,S,18]"""
+    """[A,S,19]"""
     tracks = np.full((avs, objects, kernels.TRACK), np.nan)
     tracks[..., kernels.T_CAM], tracks[..., kernels.T_TOLD] = -1.0, 0.0
     return tracks

@@ -22,14 +22,16 @@ from cosim.types import Actor, Bytes, Due, Events, Floats, Kind, Snapshot
 # Getters of every vehicle.
 READ = (
     *("Position", "Angle", "Speed", "Acceleration", "LaneID", "LanePosition"),
-    *("TimeLoss", "CO2Emission"),  # s, mg/s
+    *("TimeLoss", "CO2Emission", "Signals"),  # s, mg/s, bits
 )
 # Substitutes for persons: SUMO has no acceleration of persons, and persons have no lane. They walk beside,
 # along, against and across the lanes of vehicles.
 PERSON_DEFAULTS: tuple[Callable[[str], Any], ...] = (
     *(lambda _: 0.0, lambda _: "", lambda _: 0.0),
-    *(lambda _: 0.0, lambda _: 0.0),
+    *(lambda _: 0.0, lambda _: 0.0, lambda _: 0),
 )
+# Bits of a vehicle's signals, right and left (SUMO, TraCI/Vehicle_Signalling), -> `Snapshot.indicator`
+INDICATOR = np.array([0, -1, 1, 0], np.int8)
 PERSON = "person:"  # prefix of a person's id in a snapshot: a vehicle may have the same id
 GIVE_WAY = "mswZ"  # link states: minor, stop, all-way stop, zipper (SUMO, Networks/SUMO_Road_Networks)
 # link states at a stop line without signals (SUMO, Networks/SUMO_Road_Networks)
@@ -115,7 +117,7 @@ class SnapshotReader:
             )
             self._ids = ids
         kind, mission, length, width, actor = self._static
-        position, angle, speed, accel, lane, lane_position, time_loss, co2 = (
+        position, angle, speed, accel, lane, lane_position, time_loss, co2, lights = (
             list(map(vehicle, ids))
             if not persons
             else [person(persons[i]) if i in persons else vehicle(i) for i in ids]
@@ -151,6 +153,7 @@ class SnapshotReader:
             switches=self._switches(),
             time_loss=np.array(time_loss, np.float64),
             co2=np.array(co2, np.float64) * 1e-3,
+            indicator=INDICATOR[np.array(lights, np.int64) & 3],
             waiting=waiting,
             limits={k: m for k, name, usual in self._variable if (m := self._limit_of(name)) != usual},
         )

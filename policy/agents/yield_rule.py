@@ -10,8 +10,7 @@ from cosim.types import Decision, History, MetaAction, ObservationConfig, Policy
 from policy.agents.idm import Idm
 from policy.inputs.needs import Need, Needs
 
-# When an AV yields and how much, chosen on validation roads (research/yielding.py)
-REACH = 150.0  # m before the end of its lane, within which a merging vehicle is helped
+# When an AV yields and how much, chosen on validation roads (docs/results/yielding.md)
 GAPS = 2.0, 40.0  # m to its rear, at least and at most: an AV nearer would stand beside it
 MAX_BETWEEN = 0  # vehicles between both
 EASE = 4.0  # m/s below its speed
@@ -21,7 +20,7 @@ HOLD, REST = 8.0, 6.0  # s of yielding at most, and then without it
 
 
 class YieldRule(Idm):
-    """Accelerates, but eases off behind a vehicle that must merge and before one that has long waited."""
+    """Accelerates, but eases off for vehicles that signal onto its lane or have long waited."""
 
     name = "yield-rule"
     observation = ObservationConfig(maps=False, rows=32)
@@ -52,7 +51,7 @@ class YieldRule(Idm):
             can_slow = history.ego_speed**2 < 2.0 * APPROACH_DECEL * need.gap
             fits = can_slow and need.waited >= PATIENCE
         else:
-            fits = need.remaining < REACH and need.between <= MAX_BETWEEN and GAPS[0] <= need.gap <= GAPS[1]
+            fits = need.between <= MAX_BETWEEN and GAPS[0] <= need.gap <= GAPS[1]
         began = self._began.get((av, need.vehicle))
         if not fits or (began is None and now < self._rests.get(av, 0.0)):
             return False

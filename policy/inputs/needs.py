@@ -1,9 +1,10 @@
-"""Who needs something of an AV: vehicles whose lane ends beside it, and vehicles that wait for it at a line.
+"""Vehicles that need something of an AV: they signal a change onto its lane, or wait for it at a line.
 
-No label: each need follows from the road map and from the vehicles that the AV knows of, on any network.
+No vehicle is marked: each need follows from the road map and from what the AV knows, on any network.
 """
 
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -22,11 +23,11 @@ class Need(NamedTuple):
     """A vehicle's need of one AV."""
 
     vehicle: str
-    crossing: bool  # it waits at a line where it gives way to the AV; else its lane ends beside the AV's
+    crossing: bool  # it waits at a line where it gives way to the AV; else it signals onto the AV's lane
     gap: float  # m from the AV's front to the vehicle's rear, or (crossing) to the AV's own line
     between: int  # vehicles on the AV's lane inside this gap
     speed: float  # m/s, of the vehicle
-    remaining: float  # m, left to the vehicle before the end of its lane, or its line
+    remaining: float  # m, left to the vehicle before its line, or the end of its lane (inf: it does not end)
     waited: float  # s (`Waiting`)
 
 
@@ -55,7 +56,6 @@ class Needs:
     def __init__(self, context: PolicyContext) -> None:
         self._road, self._pooled = context.road, context.pooled
         self._waiting: dict[str, Waiting] = {}
-        self._ending = _ending_lanes(context.road)
         self._yielding = _lanes_that_yield_to(context.road)
 
     def find(self, histories: Mapping[str, History]) -> dict[str, list[Need]]:
@@ -73,27 +73,25 @@ class Needs:
         own = history.route.paths[1]
         if own is None:
             return []
-        standing = self._lines_ahead(history, own)
+        lines = self._lines_ahead(history, own)
         needs = []
         for row in np.flatnonzero(history.valid[-1] & (history.lane >= 0)).tolist()[1:]:
             lane, speed = int(history.lane[row]), float(history.kinematics[-1, row, SPEED])
             waited = waiting.update(history.ids[row], speed, history.time)
-            if lane in self._ending:
+            need = None
+            if lane in lines:
+                need = self._crossing(history, row, waited, lines[lane])
+            elif len(history.indicator) and history.indicator[row]:
                 need = self._merging(history, own, row, waited)
-            elif lane in standing:
-                need = self._waits(history, row, waited, standing[lane])
-            else:
-                need = None
             if need is not None:
                 needs.append(need)
         return needs
 
     def _merging(self, history: History, own: LanePath, row: int, waited: float) -> Need | None:
-        """The need of a vehicle on a lane that ends, if that lane lies beside the AV's."""
-        lane = int(history.lane[row])
-        theirs = self._road.path(lane)
+        """The need of a vehicle that signals a lane change, if onto the AV's path."""
+        theirs = self._road.path(int(history.lane[row]))
         meet = beside(self._road, own, theirs)
-        if meet is None:
+        if meet is None or (history.indicator[row] > 0) != meet[2] or theirs.lanes[0] in own.lanes:
             return None
         mine, other, _ = meet
         newest = history.kinematics[-1, row]
@@ -102,11 +100,11 @@ class Needs:
         gap = (mine - history.route.arc - half) - (other - place) - float(newest[LENGTH])
         ahead = along(history, own)[:, 0]
         between = int(((ahead > 0.0) & (ahead < gap + half)).sum())
-        left = theirs.length - place
+        left = theirs.length - place if theirs.dead_end else np.inf
         return Need(history.ids[row], False, gap, between, float(newest[SPEED]), left, waited)
 
-    def _waits(self, history: History, row: int, waited: float, line: float) -> Need | None:
-        """The need of a vehicle that gives way to the AV, `line` m before the AV's line."""
+    def _crossing(self, history: History, row: int, waited: float, line: float) -> Need | None:
+        """The need of a vehicle that gives way to the AV, whose own line is `line` m ahead."""
         remaining = self._road.lanes[int(history.lane[row])].length - float(history.lane_position[row])
         if remaining > LINE_RANGE:
             return None
@@ -117,9 +115,7 @@ class Needs:
         """Lanes whose vehicles give way to this AV -> m to the AV's line there."""
         front = history.route.arc + 0.5 * float(history.kinematics[-1, 0, LENGTH])
         found: dict[int, float] = {}
-        for lane, following, start in zip(
-            own.lanes, own.lanes[1:], own.lane_start[1:].tolist(), strict=False
-        ):
+        for (lane, following), start in zip(pairwise(own.lanes), own.lane_start[1:].tolist(), strict=True):
             line = start - front
             if line > AHEAD_RANGE:
                 break
@@ -128,11 +124,6 @@ class Needs:
                 for origin in self._yielding.get(link, ()):
                     found.setdefault(origin, line)
         return found
-
-
-def _ending_lanes(road: RoadMap) -> frozenset[int]:
-    """Lanes that end although the road goes on beside them, within the horizon of `RoadMap.path`."""
-    return frozenset(k for k in range(len(road.lanes)) if road.path(k).dead_end)
 
 
 def _lanes_that_yield_to(road: RoadMap) -> dict[int, frozenset[int]]:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from cosim.episode import Episode, Hook, Step, run_episode
 from cosim.host import Host
 from cosim.scenario import Scenario, load
 from cosim.scenario.vet import vetted
@@ -55,3 +58,21 @@ def test_a_drawn_road_is_driven(seed: int, tmp_path: Path) -> None:
     scenario = load(str(draw.write(seed, tmp_path)), duration=40.0)
     assert scenario.name == f"drawn/{seed}"
     assert drive(scenario).validity == ()
+
+
+def test_a_vehicle_whose_lane_ends_signals_and_the_yield_rule_eases_off_for_it() -> None:
+    host = Host(load("open/on_ramp", demand=["over"], duration=100.0), "yield-rule", 0.0)
+    eased, signals = Counter[bool](), Counter[int]()
+
+    class Watch(Hook):
+        def on_step(self, episode: Episode, step: Step) -> None:
+            eased.update(decision.accel is not None for decision in step.decisions.values())
+            signals.update(step.after.indicator[np.isin(step.after.lane, ends)].tolist())
+
+    try:
+        ends = [host.episode.simulator.road.index["joining_0"]]
+        run_episode(host.episode, host.policy, 100_000, svo=0.0, hooks=[Watch()])
+    finally:
+        host.close()
+    assert signals[1] > 0.9 * signals.total() > 0.0
+    assert eased[True] > 0

@@ -19,29 +19,39 @@ def context(road: RoadMap) -> PolicyContext:
     return PolicyContext(road, Timing(), COMPACT, 0.0, np.random.default_rng(0))
 
 
-def needs(road: RoadMap, *cars: Car) -> list[Need]:
-    return Needs(context(road)).find(histories(road, cars)).get("av", [])
+def signalling(scene: dict[str, History], **indicators: int) -> dict[str, History]:
+    """The same with the turn indicators of these vehicles on."""
+    return {
+        av: h._replace(indicator=np.array([indicators.get(name, 0) for name in h.ids], np.int8))
+        for av, h in scene.items()
+    }
 
 
-def test_a_vehicle_whose_lane_ends_beside_it_needs_the_av() -> None:
-    (need,) = needs(ENDS, AV, Car("ends", 320.0, 0, 15.0))
-    assert need == Need(
-        "ends", False, pytest.approx(15.0), 0, 15.0, pytest.approx(77.5), waited=0.0
-    )  # 20 m of centres, less two halves of 5 m; its front is at 322.5
+def needs(road: RoadMap, *cars: Car, **indicators: int) -> list[Need]:
+    return Needs(context(road)).find(signalling(histories(road, cars), **indicators)).get("av", [])
 
 
-def test_nobody_needs_it_where_no_lane_ends() -> None:
-    assert needs(straight_road(), AV, Car("other", 320.0, 0, 15.0)) == []
+OTHER = Car("other", 320.0, 0, 15.0)  # on the lane to the right of the AV
 
 
-def test_nobody_two_lanes_away_needs_it() -> None:
-    assert needs(ENDS, Car("av", 300.0, 2, 20.0, is_av=True), Car("ends", 320.0, 0, 15.0)) == []
+def test_a_vehicle_that_signals_onto_the_avs_lane_needs_it() -> None:
+    (need,) = needs(straight_road(), AV, OTHER, other=1)
+    assert need == Need("other", False, pytest.approx(15.0), 0, 15.0, np.inf, waited=0.0)
+    (need,) = needs(ENDS, AV, OTHER, other=1)
+    assert need.remaining == pytest.approx(77.5)  # its front is at 322.5, its lane ends at 400
+
+
+def test_nobody_else_does() -> None:
+    assert needs(ENDS, AV, OTHER) == []
+    assert needs(ENDS, AV, OTHER, other=-1) == []
+    assert needs(straight_road(), Car("av", 300.0, 2, 20.0, is_av=True), OTHER, other=1) == []
+    assert needs(straight_road(), AV, Car("other", 320.0, 1, 15.0), other=1) == []
 
 
 def test_vehicles_between_both_are_counted() -> None:
     ahead = Car("between", 310.0, 1, 20.0)
     beyond = Car("beyond", 330.0, 1, 20.0)
-    (need,) = needs(ENDS, AV, Car("ends", 320.0, 0, 15.0), ahead, beyond)
+    (need,) = needs(ENDS, AV, OTHER, ahead, beyond, other=1)
     assert need.between == 1
 
 
@@ -90,7 +100,7 @@ def test_a_vehicle_with_priority_needs_nobody() -> None:
 def test_the_rule_eases_off_behind_it_until_it_has_had_its_time() -> None:
     rule = YieldRule()
     rule.reset(context(ENDS))
-    scene = histories(ENDS, [AV, Car("ends", 320.0, 0, 15.0)])
+    scene = signalling(histories(ENDS, [AV, OTHER]), other=1)
     decision = rule.decide(scene)["av"]
     assert decision.accel == pytest.approx(15.0 - EASE - 20.0)
     later = {"av": scene["av"]._replace(time=HOLD + 0.1)}

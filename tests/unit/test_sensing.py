@@ -42,6 +42,7 @@ class Car:
     width: float = 2.0
     leaves: float = math.inf  # s
     accel: float = 0.0  # m/s2
+    signals: float = math.inf  # s, from then on to the left
 
 
 def snapshot(cars: list[Car], time: float) -> Snapshot:
@@ -69,6 +70,7 @@ def snapshot(cars: list[Car], time: float) -> Snapshot:
         lane=lane,
         lane_position=x + 0.5 * length,
         actor=column(lambda car: car.actor, np.int8),
+        indicator=column(lambda car: time >= car.signals - 1e-9, np.int8),
     )
 
 
@@ -104,11 +106,11 @@ MESSAGES: dict[str, Any] = {"range": 1.0, "cam": True, "forget": 3.0}  # own sen
 
 
 def test_with_perfect_sensors_an_av_knows_everything_as_it_is() -> None:
-    cars = [EGO, Car("a", 40.0), Car("b", 300.0, 0, accel=-2.0), Car("c", -80.0, 2, 31.0)]
+    cars = [EGO, Car("a", 40.0, signals=0.6), Car("b", 300.0, 0, accel=-2.0), Car("c", -80.0, 2, 31.0)]
     for truth, percepts in drive(cars, 8):
         world = percepts["ego"].world
         assert world.ids == truth.ids
-        for name in ("x", "y", "speed", "heading", "lane", "lane_position", "length", "kind"):
+        for name in ("x", "y", "speed", "heading", "lane", "lane_position", "length", "kind", "indicator"):
             np.testing.assert_allclose(getattr(world, name), getattr(truth, name), atol=1e-3, err_msg=name)
         assert not percepts["ego"].age.any()
 
@@ -288,6 +290,14 @@ def test_a_track_lives_on_without_measurements_and_ends_after_a_time() -> None:
         assert ghost["x"] == pytest.approx(50.0 + 10.0 * time, abs=0.05)
     assert known[3.0] is None
     assert known[3.8] is None
+
+
+def test_a_turn_indicator_is_as_old_as_the_measurement() -> None:
+    cars = [EGO, Car("v", 50.0, signals=1.0)]
+    for truth, percepts in drive(cars, 12, latency=0.4):
+        known = percepts["ego"].world
+        if "v" in known.row:
+            assert known.indicator[known.row["v"]] == (truth.time >= 1.4 - 1e-9)
 
 
 def test_a_place_is_used_again_without_what_was_known_of_the_one_before() -> None:

@@ -1,6 +1,6 @@
 """What each habit of the lawful car costs everybody in delay, and buys in safety.
 
-    python -m benchmarks.front [--roads N] [--habits NAME ...] [--duration S] [--workers N] [--again]
+    python -m benchmarks.front [--each N] [--habits NAME ...] [--duration S] [--workers N] [--again]
                                [--out docs/results]
 
 Each habit is taken away, or one of its constants is changed, on the same random validation roads that are
@@ -23,10 +23,11 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from benchmarks.drives import Case, measure
-from benchmarks.full_roads import ROADS, FullRoad, full_roads
+from benchmarks.full_roads import EACH, FullRoad, full_roads
 from benchmarks.tables import markdown_row, write_page
 from cosim.report.statistics import Figure as Estimate
 from cosim.report.statistics import paired_change, pooled_rate
+from sumo_scenarios.roads import NAMED
 
 RESULTS = Path("docs/results")
 PAGE, PICTURE, DATA = "front.md", "front.svg", "data/front.csv"
@@ -132,7 +133,9 @@ def page(rows: Sequence[Drive]) -> list[str]:
     lines = [markdown_row(columns), "|---" * len(columns) + "|"]
     lines += [markdown_row([one.habit, *_cells(one)]) for one in points(rows)]
     count = len({row.seed for row in paired(rows).get(CAR, ())})
-    return WORDS.format(table="\n".join(lines), picture=PICTURE, count=count, data=DATA).splitlines()
+    return WORDS.format(
+        table="\n".join(lines), picture=PICTURE, count=count, each=count // len(NAMED), data=DATA
+    ).splitlines()
 
 
 def _cells(one: Point) -> list[str]:
@@ -178,12 +181,12 @@ intervals over roads.
 
 ## Conditions
 
-{count} random roads of the validation seeds whose demand is at least their nominal capacity
-([formats](../reference/formats.md)), drivers `moderate`, 20 % AVs that always ask for more speed,
+{count} random roads of the validation seeds, equally many of each kind, whose demand is at least
+their nominal capacity ([formats](../reference/formats.md)), drivers `moderate`, 20 % AVs that always ask for more speed,
 sensing `ideal`. Test roads are not among them. Rows: [{data}]({data}).
 
 ```
-python -m benchmarks.front --roads {count}
+python -m benchmarks.front --each {each}
 ```
 """
 
@@ -193,7 +196,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--roads", type=int, default=ROADS, metavar="N")
+    parser.add_argument("--each", type=int, default=EACH, metavar="N", help="roads of a kind")
     parser.add_argument("--habits", nargs="*", default=[*HABITS], choices=[*HABITS], metavar="NAME")
     parser.add_argument(
         "--duration",
@@ -208,7 +211,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with tempfile.TemporaryDirectory() as folder:
         cases = [
             case(habit, errors, road, args.duration)
-            for road in full_roads(args.roads, Path(folder))
+            for road in full_roads(args.each, Path(folder))
             for errors in ERRORS
             for habit in args.habits
         ]

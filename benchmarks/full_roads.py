@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 from cosim.seeding import TUNING_SEEDS
 from sumo_scenarios.draw import draw, write
+from sumo_scenarios.roads import NAMED
 
 FULL = 1.0  # share of the nominal capacity that is wanted at least
-ROADS = 12  # of a benchmark
+EACH = 2  # roads of a kind
 
 
 class FullRoad(NamedTuple):
@@ -21,14 +23,13 @@ class FullRoad(NamedTuple):
     folder: Path
 
 
-def full_roads(count: int, folder: Path, kinds: tuple[str, ...] = ()) -> Iterator[FullRoad]:
-    """The first `count` full roads of the validation seeds, written to `folder`; `kinds`: empty for all."""
-    found = 0
+def full_roads(each: int, folder: Path) -> Iterator[FullRoad]:
+    """The first full roads of the validation seeds, `each` of every kind, written to `folder`."""
+    wanted = Counter(dict.fromkeys(NAMED, each))
     for seed in TUNING_SEEDS:
         drawn = draw(seed)
-        if drawn.level < FULL or (kinds and drawn.road.kind not in kinds):
-            continue
-        if found == count:
+        if drawn.level >= FULL and wanted[drawn.road.kind]:
+            wanted[drawn.road.kind] -= 1
+            yield FullRoad(seed, drawn.road.kind, write(seed, folder))
+        if not wanted.total():
             return
-        found += 1
-        yield FullRoad(seed, drawn.road.kind, write(seed, folder))

@@ -152,13 +152,13 @@ def capacity(place: Place) -> list[list[str]]:
 
 def front(place: Place) -> list[list[str]]:
     """Costs and benefits of each habit of the lawful car."""
-    few = ["--roads", "1", "--duration", "30"] if place.small else []
+    few = ["--each", "1", "--duration", "30"] if place.small else []
     return [["benchmarks.front", *few, "--out", str(place.out)]]
 
 
 def yielding(place: Place) -> list[list[str]]:
     """Scripted yielding beside the lawful car."""
-    few = ["--roads", "1", "--rules", "as it ships", "--duration", "30"] if place.small else []
+    few = ["--each", "1", "--rules", "as it ships", "--duration", "30"] if place.small else []
     return [["benchmarks.yielding", *few, "--out", str(place.out)]]
 
 

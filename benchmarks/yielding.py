@@ -1,6 +1,6 @@
 """Is there anything to learn? Scripted yielding beside the lawful car, on random roads that are full.
 
-    python -m benchmarks.yielding [--roads N] [--rules NAME ...] [--duration S] [--workers N] [--again]
+    python -m benchmarks.yielding [--each N] [--rules NAME ...] [--duration S] [--workers N] [--again]
                                   [--out docs/results]
 
 Each rule is `yield-rule` with some of its constants changed. All drive the same random validation roads.
@@ -17,9 +17,10 @@ from statistics import fmean
 from typing import Any, NamedTuple
 
 from benchmarks.drives import Case, measure
-from benchmarks.full_roads import ROADS, FullRoad, full_roads
+from benchmarks.full_roads import EACH, FullRoad, full_roads
 from benchmarks.tables import markdown_row, write_page
 from cosim.report.statistics import paired_change
+from sumo_scenarios.roads import NAMED
 
 RESULTS = Path("docs/results")
 PAGE, DATA = "yielding.md", "data/yielding.csv"
@@ -28,11 +29,12 @@ CAR = "the car"
 NEVER = float("inf")
 RULES: dict[str, dict[str, object]] = {
     "as it ships": {},
-    "300 m, 8 m/s": {"REACH": 300.0, "EASE": 8.0},
-    "300 m, 8 m/s, two between": {"REACH": 300.0, "EASE": 8.0, "MAX_BETWEEN": 2, "GAPS": (2.0, 80.0)},
-    "lanes that end alone": {"PATIENCE": NEVER},
-    "lines alone": {"REACH": 0.0},
-    "lines alone, after 15 s": {"REACH": 0.0, "PATIENCE": 15.0},
+    "2 m/s slower": {"EASE": 2.0},
+    "8 m/s slower": {"EASE": 8.0},
+    "for 15 s": {"HOLD": 15.0, "REST": 0.0},
+    "two between": {"MAX_BETWEEN": 2, "GAPS": (2.0, 80.0)},
+    "signals alone": {"PATIENCE": NEVER},
+    "lines after 15 s": {"PATIENCE": 15.0},
 }
 DRIVERS: dict[str, dict[str, Any]] = {
     CAR: {"policy": "car-alone"},
@@ -68,7 +70,7 @@ def page(rows: Sequence[Drive]) -> list[str]:
         for driver in DRIVERS:
             lines += _lines(of, kind, driver)
     count = len({row.seed for row in rows if row.driver == CAR})
-    return WORDS.format(table="\n".join(lines), count=count, data=DATA).splitlines()
+    return WORDS.format(table="\n".join(lines), count=count, each=count // len(NAMED), data=DATA).splitlines()
 
 
 TABLE = ["roads", "pairs", "driver", "delay of everybody, s", "change", "change of humans'", "hard brakings"]
@@ -95,20 +97,20 @@ def _lines(of: dict[tuple[str, str, int], Drive], kind: str, driver: str) -> Ite
 
 WORDS = """# Is there anything to learn beyond the lawful car?
 
-`yield-rule` eases off behind a vehicle whose lane ends, and before one that has long waited at a
-line. No vehicle is marked. Each row changes some of the rule's constants. Change is relative to the
+`yield-rule` eases off for a vehicle that signals onto the AV's lane, and for one that has long
+waited at a line. No vehicle is marked. Each row changes some of the rule's constants. Change is relative to the
 lawful car alone on the same roads, with 95 % intervals over roads.
 
 {table}
 
 ## Conditions
 
-{count} random roads of the validation seeds whose demand is at least their nominal capacity
-([formats](../reference/formats.md)), drivers `moderate`, errors `field`, 20 % AVs, phi 45, sensing
+{count} random roads of the validation seeds, equally many of each kind, whose demand is at least
+their nominal capacity ([formats](../reference/formats.md)), drivers `moderate`, errors `field`, 20 % AVs, phi 45, sensing
 `ideal`. Rows: [{data}]({data}).
 
 ```
-python -m benchmarks.yielding --roads {count}
+python -m benchmarks.yielding --each {each}
 ```
 """
 
@@ -118,8 +120,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--roads", type=int, default=ROADS, metavar="N")
-    parser.add_argument("--kinds", nargs="*", default=(), metavar="KIND")
+    parser.add_argument("--each", type=int, default=EACH, metavar="N", help="roads of a kind")
     parser.add_argument("--rules", nargs="*", default=[*RULES], choices=[*RULES], metavar="NAME")
     parser.add_argument("--duration", type=float, metavar="S", help="for a folder of its own")
     parser.add_argument("--workers", type=int, default=2, metavar="N")
@@ -127,7 +128,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=RESULTS, metavar="FOLDER")
     args = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as folder:
-        roads = [*full_roads(args.roads, Path(folder), tuple(args.kinds))]
+        roads = [*full_roads(args.each, Path(folder))]
         cases = [case(driver, road, args.duration) for road in roads for driver in (CAR, *args.rules)]
         rows = measure(Drive, cases, args.workers, args.out / DATA, args.again)
     write_page(args.out / PAGE, page(rows))

@@ -133,9 +133,8 @@ def page(rows: Sequence[Drive]) -> list[str]:
     lines = [markdown_row(columns), "|---" * len(columns) + "|"]
     lines += [markdown_row([one.habit, *_cells(one)]) for one in points(rows)]
     count = len({row.seed for row in paired(rows).get(CAR, ())})
-    return WORDS.format(
-        table="\n".join(lines), picture=PICTURE, count=count, each=count // len(NAMED), data=DATA
-    ).splitlines()
+    of = {"count": count, "each": count // len(NAMED), "picture": PICTURE, "data": DATA}
+    return WORDS.format(table="\n".join(lines), **of).splitlines()
 
 
 def _cells(one: Point) -> list[str]:
@@ -182,8 +181,9 @@ intervals over roads.
 ## Conditions
 
 {count} random roads of the validation seeds, equally many of each kind, whose demand is at least
-their nominal capacity ([formats](../reference/formats.md)), drivers `moderate`, 20 % AVs that always ask for more speed,
-sensing `ideal`. Test roads are not among them. Rows: [{data}]({data}).
+their nominal capacity ([formats](../reference/formats.md)), drivers `moderate`, 20 % AVs that
+always ask for more speed, sensing `ideal`. Test roads are not among them. Rows:
+[{data}]({data}).
 
 ```
 python -m benchmarks.front --each {each}

@@ -98,16 +98,16 @@ def _lines(of: dict[tuple[str, str, int], Drive], kind: str, driver: str) -> Ite
 WORDS = """# Is there anything to learn beyond the lawful car?
 
 `yield-rule` eases off for a vehicle that signals onto the AV's lane, and for one that has long
-waited at a line. No vehicle is marked. Each row changes some of the rule's constants. Change is relative to the
-lawful car alone on the same roads, with 95 % intervals over roads.
+waited at a line. No vehicle is marked. Each row changes some of the rule's constants. Change is
+relative to the lawful car alone on the same roads, with 95 % intervals over roads.
 
 {table}
 
 ## Conditions
 
 {count} random roads of the validation seeds, equally many of each kind, whose demand is at least
-their nominal capacity ([formats](../reference/formats.md)), drivers `moderate`, errors `field`, 20 % AVs, phi 45, sensing
-`ideal`. Rows: [{data}]({data}).
+their nominal capacity ([formats](../reference/formats.md)), drivers `moderate`, errors `field`,
+20 % AVs, phi 45, sensing `ideal`. Rows: [{data}]({data}).
 
 ```
 python -m benchmarks.yielding --each {each}

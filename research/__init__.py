@@ -1,1 +1,1 @@
-"""Claims as data: a paper's statement and its test; the engine drives, tests and writes pages."""
+"""Claims as data: a statement and its statistical test. The engine drives, tests and writes the pages."""

@@ -1,4 +1,4 @@
-"""An audit: drive a sample of the kept episodes again and compare them."""
+"""An audit: drives a sample of the kept episodes again and compares the rows."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ class Audited:
 
 
 def audit(work: Work, settings: Settings, sample: int, pick: int = 0) -> Audited:
-    """Drive `sample` of the kept episodes, picked by `pick`, and compare every column."""
+    """Drive `sample` of the kept episodes, drawn with the seed `pick`, and compare every column."""
     rows = kept.episodes(settings.kept).rows
-    mine = [row for row in rows if row["cell"] in work.wanted]
-    picked = random.Random(pick).sample(mine, min(sample, len(mine)))
+    known = [row for row in rows if row["cell"] in work.wanted]
+    picked = random.Random(pick).sample(known, min(sample, len(known)))
     picked.sort(key=lambda row: row["key"])  # group the episodes of a cell
-    anew = _driven(picked, work, settings)
-    differing = tuple(line for row in picked for line in _differences(row, anew[row["key"]]))
-    return Audited(len(picked), differing, len(rows), len(rows) - len(mine))
+    again = _driven(picked, work, settings)
+    differing = tuple(line for row in picked for line in _differences(row, again[row["key"]]))
+    return Audited(len(picked), differing, len(rows), len(rows) - len(known))
 
 
 # ---- inside ----
@@ -55,22 +55,22 @@ def _driven(rows: list[Row], work: Work, settings: Settings) -> dict[str, dict[s
     return found
 
 
-def _differences(row: Row, anew: Row) -> Iterator[str]:
+def _differences(row: Row, again: Row) -> Iterator[str]:
     """A line for every differing column."""
-    if anew["status"] != OK:
-        yield f"{row['key']}: {anew['status']}: {anew['error'] or anew['stderr']}"
+    if again["status"] != OK:
+        yield f"{row['key']}: {again['status']}: {again['error'] or again['stderr']}"
         return
     episode = f"{row['key']}: {row['policy']} in {row['scenario']}, seed {row['seed']}"
-    for name, value in kept.plain(anew).items():
+    for name, value in kept.plain(again).items():
         if name in row and not _same(name, row[name], value):
             yield f"{episode}: {name} is {value}, kept is {row[name]}"
 
 
 def _same(name: str, before: Any, now: Any) -> bool:
-    """Whether a column equals the kept one; for collisions, in the fields stored then."""
+    """Whether a column equals the kept one. Collisions are compared in the fields of the kept row."""
     if name != "collision_list" or before == now or None in (before, now):
         return bool(before == now)
-    then, today = json.loads(before), json.loads(now)
-    return len(then) == len(today) and all(
-        old == {key: new.get(key) for key in old} for old, new in zip(then, today, strict=True)
+    kept_list, new_list = json.loads(before), json.loads(now)
+    return len(kept_list) == len(new_list) and all(
+        old == {key: new.get(key) for key in old} for old, new in zip(kept_list, new_list, strict=True)
     )

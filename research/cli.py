@@ -1,4 +1,4 @@
-"""`python -m research`: claims are listed, driven, written as pages, kept, checked."""
+"""`python -m research`: lists claims, drives their episodes, writes, checks and audits their pages."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ STALE, INTERRUPTED = 1, 130  # exit codes
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """0, or what went wrong: 1 a page is stale or an episode differs, 2 a claim is wrong, 130 interrupted."""
+    """Exit code: 0; 1 a page is stale or an episode differs; 2 a claim is invalid; 130 interrupted."""
     args = _parser().parse_args(arguments)
     try:
         claims = [*schema.chosen(args.names, args.claims)]
@@ -29,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
-        print("interrupted: the same command goes on", file=sys.stderr)
+        print("interrupted: the same command continues", file=sys.stderr)
         return INTERRUPTED
 
 
@@ -47,11 +47,11 @@ def _list(claims: list[Claim], settings: Settings, args: argparse.Namespace) -> 
 
 
 def _drive(claims: list[Claim], settings: Settings, _: argparse.Namespace) -> int:
-    """Drive what is missing."""
+    """Drive the missing episodes."""
     found = drive.drive(claims, settings)
-    lacking = [c.name for c in claims if not all(a.complete for a in found.arms[c.name].values())]
-    if lacking:
-        print(f"research: episodes are missing of {', '.join(lacking)}", file=sys.stderr)
+    incomplete = [c.name for c in claims if not all(a.complete for a in found.arms[c.name].values())]
+    if incomplete:
+        print(f"research: episodes are missing for {', '.join(incomplete)}", file=sys.stderr)
     return 0
 
 
@@ -60,9 +60,9 @@ def _page(claims: list[Claim], settings: Settings, args: argparse.Namespace) -> 
     found = drive.held(claims, settings)
     for claim in claims:
         arms = found.arms[claim.name]
-        lacking = sum(len(arm.seeds) - len(arm.rows) for arm in arms.values())
-        if lacking or not arms:
-            print(f"{claim.name}: left as it is: {lacking} episodes are not driven", file=sys.stderr)
+        missing = sum(len(arm.seeds) - len(arm.rows) for arm in arms.values())
+        if missing or not arms:
+            print(f"{claim.name}: page unchanged: {missing} episodes are missing", file=sys.stderr)
             continue
         print(page.write(evaluate.evaluate(claim, arms, found.notes), settings, args.out))
     print(index.write([*schema.chosen([], args.claims)], args.out))
@@ -70,12 +70,10 @@ def _page(claims: list[Claim], settings: Settings, args: argparse.Namespace) -> 
 
 
 def _check(claims: list[Claim], settings: Settings, args: argparse.Namespace) -> int:
-    """Whether every page is of the weights and definitions that are here."""
+    """Check that every page was made with the present weights and definitions."""
     work = drive.planned(claims, settings)
     lines = [line for claim in claims for line in index.stale(claim, work, args.out)]
-    print(
-        *lines, f"{len(lines)} differences: `drive` and `page` make the pages anew" if lines else "", sep="\n"
-    )
+    print(*lines, f"{len(lines)} differences: `drive` and `page` update the pages" if lines else "", sep="\n")
     return STALE if lines else 0
 
 
@@ -89,12 +87,12 @@ def _keep(claims: list[Claim], settings: Settings, _: argparse.Namespace) -> int
 
 
 def _audit(claims: list[Claim], settings: Settings, args: argparse.Namespace) -> int:
-    """Drive some of the kept episodes anew: are they the same in every figure and the trace hash?"""
+    """Drive a sample of the kept episodes again; compare every figure and the trace hash."""
     found = audit.audit(drive.planned(claims, settings), settings, args.sample, args.pick)
     print(*found.differing, sep="\n", end="\n" if found.differing else "")
     wrong = len({line.split(":")[0] for line in found.differing})
-    print(f"{found.driven - wrong} of {found.driven} driven anew are the same in every figure and trace hash")
-    print(f"{found.kept} are kept; of other weights, files or versions than here: {found.unknown}")
+    print(f"{found.driven - wrong} of {found.driven} driven again are equal in every figure and trace hash")
+    print(f"{found.kept} are kept; with other weights, files or versions than here: {found.unknown}")
     return STALE if found.differing else 0
 
 
@@ -106,19 +104,19 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     add, default = parser.add_argument, Settings()
     add("--workers", type=int, default=default.workers, metavar="N")
     add("--engine", choices=("local", "ray"), default=default.engine)
-    add("--scale", type=float, default=default.scale, metavar="X", help="of the numbers of episodes")
-    add("--seeds", metavar="A:B", help="in place of every claim's own")
+    add("--scale", type=float, default=default.scale, metavar="X", help="factor on the number of episodes")
+    add("--seeds", metavar="A:B", help="instead of every claim's own seeds")
     add("--scenario", action="append", default=[], choices=sumo_scenarios.shipped())
-    add("--duration", type=float, metavar="S", help="of an episode (default: the scenario's)")
-    add("--untrained", action="store_true", help="networks with initial weights may drive, labelled so")
-    add("--runs", type=Path, default=default.runs, metavar="DIR", help="where the episodes are stored")
+    add("--duration", type=float, metavar="S", help="episode duration (default: the scenario's)")
+    add("--untrained", action="store_true", help="also drive networks with initial weights, labelled so")
+    add("--runs", type=Path, default=default.runs, metavar="DIR", help="folder of driven episodes")
     add("--out", type=Path, default=page.OUT, metavar="DIR", help="folder of pages")
-    add("--kept", type=Path, default=default.kept, metavar="DIR", help="episodes that need not be driven")
+    add("--kept", type=Path, default=default.kept, metavar="DIR", help="folder of kept episodes")
     add("--anew", action="store_true", help="drive the kept episodes too")
 
 
 def settings_of(args: argparse.Namespace) -> Settings:
-    """The settings as typed. Raises BadInput for seeds that are none."""
+    """The settings of the parsed flags. Raises BadInput for invalid seeds."""
     return Settings(
         runs=args.runs,
         workers=args.workers,
@@ -139,10 +137,12 @@ def _parser() -> argparse.ArgumentParser:
         command = commands.add_parser(name, help=work.__doc__, description=work.__doc__)
         command.set_defaults(work=work)
         command.add_argument("names", nargs="*", metavar="NAME", help="claims (default: all)")
-        command.add_argument("--claims", type=Path, default=schema.FOLDER, metavar="DIR", help="their folder")
+        command.add_argument(
+            "--claims", type=Path, default=schema.FOLDER, metavar="DIR", help="folder of claims"
+        )
         add_flags(command)
         if work is _audit:
-            about = f"episodes (default {SAMPLE})"
+            about = f"number of episodes (default {SAMPLE})"
             command.add_argument("--sample", type=int, default=SAMPLE, metavar="N", help=about)
-            command.add_argument("--pick", type=int, default=0, metavar="SEED", help="which ones")
+            command.add_argument("--pick", type=int, default=0, metavar="SEED", help="of the random sample")
     return parser

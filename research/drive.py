@@ -44,7 +44,7 @@ class Settings:
     engine: str = "local"  # or "ray"
     kept: Path | None = kept.FOLDER  # folder of stored episodes; None: drive all
     scale: float = 1.0  # factor on the numbers of episodes
-    seeds: range | None = None  # in place of every claim's own
+    seeds: range | None = None  # instead of every claim's own
     scenarios: tuple[str, ...] = ()  # (): all of a claim
     duration: float | None = None  # s; None: the scenario's own
     untrained: bool = False  # value networks with initial weights may drive
@@ -55,7 +55,7 @@ class Settings:
         return seeds[: max(round(len(seeds) * self.scale), MIN_EPISODES)]
 
     def conditions(self, claim: Claim) -> list[Condition]:
-        """Those of the scenarios that are wanted."""
+        """The claim's conditions in the wanted scenarios."""
         return [c for c in claim.conditions if not self.scenarios or c.scenario in self.scenarios]
 
 
@@ -136,13 +136,14 @@ def drive(claims: Sequence[Claim], settings: Settings) -> Driven:
     Raises BadInput (nothing is driven then) and CosimError as `cosim evaluate` does.
     """
     work = planned(claims, settings)
-    for label in sorted({f"{policy(a.cell)}: {a.label}" for a in _every(work) if a.label}):
+    arms = [arm for of_claim in work.arms.values() for arm in of_claim.values()]
+    for label in sorted({f"{policy(arm.cell)}: {arm.label}" for arm in arms if arm.label}):
         print(f"research: {label}{'' if settings.untrained else ', not driven'}", file=sys.stderr)
     with opened(work, settings) as store:
         with Progress("research", "episodes") as progress:
             faults = execution.drive(work, store, engine(settings), settings.runs / "outputs", progress)
         for fault in faults:
-            print(f"research: {fault.key}: our own code failed, no row: {fault.stderr}", file=sys.stderr)
+            print(f"research: {fault.key}: internal error, no row: {fault.stderr}", file=sys.stderr)
         return _found(work, store)
 
 
@@ -155,7 +156,7 @@ def held(claims: Sequence[Claim], settings: Settings) -> Driven:
 
 @contextmanager
 def opened(work: Work, settings: Settings) -> Iterator[Store]:
-    """The store, which knows the cells of `work` and holds what is kept of it. One process at a time."""
+    """The store with the cells of `work` and its kept episodes, locked against other processes."""
     with (
         RunFolder(str(settings.runs), resume=True, episodes=work.episodes) as folder,
         Store.in_folder(folder.path) as store,
@@ -184,7 +185,7 @@ def engine(settings: Settings) -> Engine:
 
 
 class Runner(EpisodeRunner):
-    """Hosted by the engine: as `cosim evaluate` drives, for policies whose name has a mark."""
+    """Hosted by the engine: drives as `cosim evaluate` does, for marked policy names (`kept.MARK`)."""
 
     def policy(self, case: EpisodeOptions) -> str:
         """The policy's name for `--policy`."""
@@ -223,23 +224,15 @@ def _short(document: Any) -> str:
     return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()[:12]
 
 
-def _every(work: Work) -> Iterator[Arm]:
-    for arms in work.arms.values():
-        yield from arms.values()
-
-
 def _found(work: Work, store: Store) -> Driven:
     """The arms with their rows."""
-    rows: dict[str, dict[int, Row]] = {}
-    for row in store.rows():
-        rows.setdefault(row["cell"], {})[row["seed"]] = row
+    rows = {(row["cell"], row["seed"]): row for row in store.rows()}
     filled = {
-        name: {key: replace(arm, rows=_rows(arm, rows.get(arm.cell.name, {}))) for key, arm in arms.items()}
+        name: {
+            key: replace(arm, rows=tuple(rows[k] for s in arm.seeds if (k := (arm.cell.name, s)) in rows))
+            for key, arm in arms.items()
+        }
         for name, arms in work.arms.items()
     }
     document = store.document()
     return Driven(filled, {name: document[name] for name in ("units", "better")})
-
-
-def _rows(arm: Arm, by_seed: Mapping[int, Row]) -> tuple[Row, ...]:
-    return tuple(by_seed[seed] for seed in arm.seeds if seed in by_seed)

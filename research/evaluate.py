@@ -20,7 +20,7 @@ from cosim.workers.tasks import OK
 from research.drive import Arm, Arms, policy
 from research.schema import Claim, Condition
 
-SIGNIFICANT = 0.05  # of a p that is corrected for all tests of the claim
+SIGNIFICANT = 0.05  # level for p, which is corrected for all tests of the claim
 Verdict = Literal["yes", "no", "not resolved"]
 
 
@@ -62,7 +62,7 @@ class Tested:
 
     condition: Condition
     against: str
-    found: PairedFigure  # difference: the claim's arm less `against`
+    found: PairedFigure  # difference: the claim's arm minus `against`
     p: float
     p_holm: float
     power: float  # to find the smallest effect of interest
@@ -80,7 +80,7 @@ class Found:
 
     @property
     def verdict(self) -> Verdict:
-        """The verdict of the claim, which must hold everywhere or somewhere."""
+        """The verdict over all comparisons; `Claim.holds` says in how many the claim must hold."""
         verdicts = {one.verdict for one in self.tested}
         decisive: Verdict = "no" if self.claim.holds == "everywhere" else "yes"
         other: Verdict = "yes" if decisive == "no" else "no"
@@ -137,7 +137,7 @@ class Found:
 def evaluate(claim: Claim, arms: Arms, notes: Mapping[str, Mapping[str, str]]) -> Found:
     """Test the claim on these episodes.
 
-    Raises BadInput: a metric that the episodes do not have, or a test that is not one of its kind.
+    Raises BadInput: a metric that the episodes do not have, or a test that does not fit the primary metric.
     """
     rows = [row for arm in arms.values() for row in arm.rows]
     known = measures(rows, notes.get("units"), notes.get("better"))
@@ -148,7 +148,7 @@ def evaluate(claim: Claim, arms: Arms, notes: Mapping[str, Mapping[str, str]]) -
             )
     primary = known[claim.primary.metric]
     if (claim.test == "mcnemar") != primary.is_rate:
-        problem = f"{primary.name} is {'a' if primary.is_rate else 'no'} share of episodes"
+        problem = f"{primary.name} is {'a' if primary.is_rate else 'not a'} share of episodes"
         raise BadInput(problem, file=claim.name, field="test", value=claim.test)
     conditions = dict.fromkeys(condition for condition, _ in arms)
     compared = [
@@ -171,7 +171,7 @@ def evaluate(claim: Claim, arms: Arms, notes: Mapping[str, Mapping[str, str]]) -
 
 
 def pairs(before: Arm, after: Arm) -> list[tuple[Row, Row]]:
-    """The episodes of both on equal seeds that both drove to the end."""
+    """The episodes of both arms on equal seeds, if both completed."""
     first = {row["seed"]: row for row in _ok(before.rows)}
     return [(first[row["seed"]], row) for row in _ok(after.rows) if row["seed"] in first]
 
@@ -198,7 +198,7 @@ def traffic_of(arm: Arm) -> Traffic:
 def _line(
     condition: Condition, arm: Arm, what: tuple[str, str, str, str], shown: Figure, counts: tuple[int, int]
 ) -> Line:
-    """A figure of `arm`, or a difference of it: `what` is arm, against, figure and unit."""
+    """A figure of `arm`, or its difference from another arm. `what`: arm, against, figure and unit."""
     here = traffic_of(arm)
     return Line(
         *(condition.scenario, condition.text, *what),
@@ -224,7 +224,7 @@ def _p(claim: Claim, measure: Measure, found: PairedFigure, both: Sequence[tuple
 
 
 def _verdict(claim: Claim, difference: Figure, p: float) -> Verdict:
-    """Yes: a difference the claimed way beyond chance. No: none as large as the smallest of interest."""
+    """Yes: a significant difference in the claimed direction. No: the interval excludes `power.smallest`."""
     if not difference.known:
         return "not resolved"
     sign = claim.primary.sign

@@ -1,9 +1,10 @@
-"""T's figure 8: how an AV makes room for the merging vehicle, in sample episodes found among many.
+"""T's figure 8: how an AV makes room for the merging vehicle, in sample episodes.
 
     python -m research.figure8 [--workers 2] [--runs DIR] [--out DIR]
 
-The altruists of the claim `t_figures` drive the merge, recorded; every episode is sorted by what its guide AV
-did (`research.guide`). The first of each kind is shown, with the number of each. Killed, the same goes on.
+The altruists of the claim `t_figures` drive the merge and are recorded. Each episode is classified by the
+maneuver of its guide AV (`research.guide`). The page shows the number of each kind and its first episode. An
+interrupted run continues with the same command.
 """
 
 from __future__ import annotations
@@ -29,28 +30,38 @@ from cosim.workers.tasks import Task
 from research import cli, drive, page, picture, schema
 from research.drive import Arm, Settings
 from research.evaluate import Line
-from research.guide import BEFORE, KINDS, OTHER, OVERTAKES, SHOWN, SLOWER, SLOWS, YIELDS, GuideRunner
+from research.guide import (
+    KINDS,
+    LOOKBACK,
+    MIN_SLOWING,
+    OTHER,
+    OVERTAKES,
+    PICTURE_TIMES,
+    SLOWS,
+    YIELDS,
+    GuideRunner,
+)
 from research.schema import Condition
 
 NAME, CLAIM, SCENARIO = "t_figure8", "t_figures", "merge"
 ARMS = ("altruist", "altruist-rule")  # the learned altruist, and a scripted one
-FOLDER = "guide"  # in the folder of runs: a small file an episode
-MOST = 100  # episodes of an arm and demand
-WANTED = (SLOWS, YIELDS, OVERTAKES)  # T's three samples, from left to right
+FOLDER = "guide"  # in the folder of runs, with one small file per episode
+MAX_EPISODES = 100  # per arm and demand
+SAMPLES = (SLOWS, YIELDS, OVERTAKES)  # T's three samples, from left to right
 HEADING = f"""\
 # Figure 8 of T: how an AV makes room
 
-The guide AV is the one nearest to the merging vehicle when it merges, of those that perceive it and drove
-in the lane it merges into within the {BEFORE:g} s before. It made room if it lost {SLOWER:g} m/s or more in
-that time, or moved to the left. Every picture is 200 m wide. "{OTHER}": it merged, and no AV had to make
-room.
+The guide AV is the AV nearest to the merging vehicle at the moment of the merge. Only AVs count that
+perceive the merging vehicle and drove in its target lane within the {LOOKBACK:g} s before. The guide
+AV made room if it slowed by {MIN_SLOWING:g} m/s or more in that time, or moved to the left. Every
+picture is 200 m wide. "{OTHER}": the vehicle merged, and no AV had to make room.
 """
 GuideRow = Mapping[str, Any]  # of `GuideRunner.run`
 Found = Mapping[tuple[Condition, str], tuple[Arm, list[GuideRow]]]
 
 
 def record(settings: Settings) -> Found:
-    """Every episode, recorded, or read where it was; what fails is named and tried again next time.
+    """Every episode, recorded now or read from its file. The next run tries failed episodes again.
 
     Raises BadInput and CosimError as `research.drive.drive`.
     """
@@ -64,7 +75,9 @@ def record(settings: Settings) -> Found:
     folder = settings.runs / FOLDER
     with RunFolder(str(folder), resume=True, episodes=0):
         cases = [
-            (arm.cell, arm.cell.case.with_seed(seed)) for arm in arms.values() for seed in arm.seeds[:MOST]
+            (arm.cell, arm.cell.case.with_seed(seed))
+            for arm in arms.values()
+            for seed in arm.seeds[:MAX_EPISODES]
         ]
         _drive(
             [cell.task(case) for cell, case in cases if not _file(folder, case.key).exists()],
@@ -81,11 +94,11 @@ def write(found: Found, settings: Settings, out: Path) -> Path:
         lines += _counted(condition, found, rows)
     for name in dict.fromkeys(name for _, name in found):
         mine = [(c, arm, row) for (c, other), (arm, seen) in found.items() if other == name for row in seen]
-        for kind in WANTED:
+        for kind in SAMPLES:
             lines += [f"## {name}: {kind}", ""]
             first = next((one for one in mine if one[2]["guided"]["kind"] == kind), None)
             lines += (
-                _sample(f"{name}-{WANTED.index(kind) + 1}", *first, out)
+                _sample(f"{name}-{SAMPLES.index(kind) + 1}", *first, out)
                 if first
                 else [f"None of {len(mine)}."]
             )
@@ -101,7 +114,7 @@ def write(found: Found, settings: Settings, out: Path) -> Path:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """0, or what went wrong: 2 the claim is wrong, 4 it cannot go on."""
+    """Exit code: 0; 2 the claim is invalid; 4 the drives cannot continue."""
     parser = argparse.ArgumentParser(prog="python -m research.figure8", description=__doc__)
     cli.add_flags(parser)
     args = parser.parse_args(arguments)
@@ -112,7 +125,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code
     if not any(rows for _, rows in found.values()):
-        print(f"{NAME}: left as it is: no episode was driven", file=sys.stderr)
+        print(f"{NAME}: page unchanged: no episode was driven", file=sys.stderr)
         return 0
     print(write(found, settings, args.out))
     return 0
@@ -127,12 +140,12 @@ def _file(folder: Path, key: str) -> Path:
 
 def _kept(folder: Path, arm: Arm) -> list[GuideRow]:
     """The recorded episodes of one arm, by seed."""
-    files = [_file(folder, arm.cell.case.with_seed(seed).key) for seed in arm.seeds[:MOST]]
+    files = [_file(folder, arm.cell.case.with_seed(seed).key) for seed in arm.seeds[:MAX_EPISODES]]
     return [json.loads(file.read_text()) for file in files if file.exists()]
 
 
 def _counted(condition: Condition, found: Found, lines: list[Line]) -> list[str]:
-    """How many episodes of each kind; rates with their intervals into `lines`."""
+    """The table of episodes by kind; appends their shares with intervals to `lines`."""
     heads = ["", "weights", *KINDS, "did not merge", "episodes"]
     rows = [heads, ["---"] * len(heads)]
     for (other, name), (arm, episodes) in found.items():
@@ -177,7 +190,7 @@ def _sample(stem: str, condition: Condition, arm: Arm, episode: GuideRow, out: P
         f"`{episode['trace_hash'][:16]}`; merged {g['merged']:.1f} s after the episode began.",
         *("", f"![speeds]({stem}.svg)", ""),
     ]
-    for k, (png, shift) in enumerate(zip(episode["pictures"], SHOWN, strict=False)):
+    for k, (png, shift) in enumerate(zip(episode["pictures"], PICTURE_TIMES, strict=False)):
         file = out / f"{stem}-{k + 1}.png"
         file.write_bytes(base64.b64decode(png))
         lines += [f"{shift:+g} s:", "", f"![{shift:+g} s]({file.name})", ""]
@@ -185,7 +198,7 @@ def _sample(stem: str, condition: Condition, arm: Arm, episode: GuideRow, out: P
 
 
 def _drive(todo: Sequence[Task], folder: Path, settings: Settings) -> None:
-    """Each episode into a file of its own, whole or not at all."""
+    """Drive the tasks; write each episode atomically to a file of its own."""
     engine = LocalEngine(GuideRunner, workers=settings.workers)
     with Progress(NAME, "episodes") as progress, closing(engine.run(todo)) as outcomes:
         for k, outcome in enumerate(outcomes, 1):

@@ -1,4 +1,4 @@
-"""What the guide AV does: who it is, and how it makes room for the merging vehicle (T, figure 8)."""
+"""The guide AV of an episode, and how it makes room for the merging vehicle (T, figure 8)."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ SLOWS, YIELDS, OVERTAKES, OTHER, NONE = KINDS = (
     "neither",
     "no AV at the merging point",
 )
-BEFORE = 15.0  # s before the merge in which room is made
-NEAR = (-125.0, 20.0)  # m along the road from the merging vehicle: AVs that perceive it or drive beside it
-SLOWER = 2.0  # m/s that it lost: it made room
-LANE = 3.2  # m, a lane's width; half of it to either side is in a lane
+LOOKBACK = 15.0  # s before the merge in which the guide AV may make room
+GUIDE_REACH = (-125.0, 20.0)  # m along the road from the merging vehicle: AVs that perceive or pass it
+MIN_SLOWING = 2.0  # m/s lost by an AV that makes room
+LANE_WIDTH = 3.2  # m
 WIDTH, HEIGHT = 760, 120  # pixels of a snapshot
-SHOWN = (-5.0, 0.0, 5.0)  # s from the merge
+PICTURE_TIMES = (-5.0, 0.0, 5.0)  # s from the merge
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class Guided:
 
 
 class GuideRunner(Runner):
-    """Hosted by the engine: drives an episode, looks at its guide AV and takes three pictures."""
+    """Hosted by the engine: drives an episode, classifies its guide AV and takes three pictures."""
 
     def run(
         self, case: EpisodeOptions, warnings: tuple[str, ...], outputs: str | None, progress: Progress
@@ -58,7 +58,7 @@ class GuideRunner(Runner):
 
 
 def guided(r: ReplayData) -> Guided:
-    """Which AV made room, and how."""
+    """The guide AV of a recorded episode, and the kind of its maneuver."""
     mission = next((t for t in r.tracks if t.mission), None)
     at = None if mission is None else _merge(r, mission)
     if mission is None or at is None:
@@ -66,7 +66,7 @@ def guided(r: ReplayData) -> Guided:
     k = at - mission.first
     frame = _Frame(mission, k, r.road.lanes[int(mission.lane[k])])
     avs = [t for t in r.tracks if t.kind == Kind.AV]
-    candidates = [(gap, t) for t in avs if (gap := frame.meets(t, at, r.interval)) is not None]
+    candidates = [(gap, t) for t in avs if (gap := frame.distance(t, at, r.interval)) is not None]
     merged = float(r.times[at] - r.begin)
     if not candidates:
         return Guided(NONE, merged, mission=mission.id)
@@ -84,7 +84,7 @@ def guided(r: ReplayData) -> Guided:
 
 
 def _merge(r: ReplayData, mission: Track) -> int | None:
-    """The frame in which the merging vehicle is first on a lane that it changed to; None if it never is."""
+    """The first frame after the merging vehicle's change to the left; None without a change."""
     lanes = r.road.lanes
     for k in range(1, len(mission.lane)):
         a, b = int(mission.lane[k - 1]), int(mission.lane[k])
@@ -117,33 +117,33 @@ class _Frame:
         """[k] m to the left of the middle of the lane that was merged into."""
         return np.asarray(np.stack([t.x, t.y], 1) @ self._left) - self._middle
 
-    def meets(self, t: Track, at: int, interval: float) -> float | None:
-        """How near (m) it is to the merge, if it drove in that lane shortly before; else None."""
+    def distance(self, t: Track, at: int, interval: float) -> float | None:
+        """m from the merging vehicle along the road; None: not in the target lane shortly before, or far."""
         now = at - t.first
-        first = max(now - round(BEFORE / interval), 0)
-        if not 0 <= now < len(t.x) or not (np.abs(self.across(t)[first : now + 1]) < LANE / 2).any():
+        first = max(now - round(LOOKBACK / interval), 0)
+        if not 0 <= now < len(t.x) or not (np.abs(self.across(t)[first : now + 1]) < LANE_WIDTH / 2).any():
             return None
         gap = float(self.along(t)[now] - self.along(self._mission)[self._k])
-        return abs(gap) if NEAR[0] <= gap <= NEAR[1] else None
+        return abs(gap) if GUIDE_REACH[0] <= gap <= GUIDE_REACH[1] else None
 
     def kind(self, t: Track, at: int, interval: float) -> str:
         """One of KINDS."""
         now = at - t.first
-        first = max(now - round(BEFORE / interval), 0)
+        first = max(now - round(LOOKBACK / interval), 0)
         across = self.across(t)
-        if across[now] - across[first] > LANE / 2:
+        if across[now] - across[first] > LANE_WIDTH / 2:
             return YIELDS
         speeds = t.speed[first : now + 1]
-        slowed = float((np.maximum.accumulate(speeds) - speeds).max()) >= SLOWER
+        slowed = float((np.maximum.accumulate(speeds) - speeds).max()) >= MIN_SLOWING
         end = min(t.first + len(t.x), self._mission.first + len(self._mission.x)) - 1
         ahead = self.along(t)[end - t.first] - self.along(self._mission)[end - self._mission.first]
-        if slowed and (across[now:] - across[now]).max() > LANE / 2 and ahead > 0.0:
+        if slowed and (across[now:] - across[now]).max() > LANE_WIDTH / 2 and ahead > 0.0:
             return OVERTAKES
         return SLOWS if slowed else OTHER
 
 
 def _speeds(t: Track, frames: int) -> tuple[float | None, ...]:
-    """Its speed in every recorded frame."""
+    """[frames] m/s, the vehicle's speed; None: not on the road."""
     found: list[float | None] = [None] * frames
     for k, speed in enumerate(t.speed.tolist()):
         found[t.first + k] = round(speed, 3)
@@ -151,11 +151,11 @@ def _speeds(t: Track, frames: int) -> tuple[float | None, ...]:
 
 
 def _pictures(r: ReplayData, found: Guided) -> list[bytes]:
-    """The road around the merging vehicle at SHOWN; [] where there is no guide."""
+    """The road around the merging vehicle at PICTURE_TIMES; [] without a guide AV."""
     if not found.guide or found.merged is None:
         return []
     pictures = []
-    for shift in SHOWN:
+    for shift in PICTURE_TIMES:
         time = float(np.clip(r.begin + found.merged + shift, r.times[0], r.times[-1]))
         poses = poses_at(r, time)
         middle = next((p for p in poses if p.track.id == found.mission), None)

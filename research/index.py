@@ -19,8 +19,7 @@ INDEX = """\
 
 P: Valiente et al., prediction-aware cooperative driving. T: Toghi et al., altruistic maneuver planning.
 Both simulate with HighwayEnv, we with SUMO; scenarios and demands are ours. Every line is written by
-`python -m research page` from `research/claims/`. A claim without a verdict is not driven yet; a page of
-its name, where there is one, answers a smaller question.
+`python -m research page` from `research/claims/`. A claim without a verdict has not been driven yet.
 
 | claim | source | verdict | page |
 |---|---|---|---|
@@ -46,7 +45,7 @@ def answer(claim: Claim, out: Path) -> str:
     page = out / f"{claim.name}.md"
     text = page.read_text(encoding="utf-8") if page.is_file() else ""
     paragraphs = [" ".join(part.split()) for part in text.split("\n\n")]
-    found = re.match(r"\*\*([\w ]+\.)\*\* .*?: (less .*)\. By condition:", "".join(paragraphs[1:2]))
+    found = re.match(r"\*\*([\w ]+\.)\*\* .*?: (difference to .*)\. By condition:", "".join(paragraphs[1:2]))
     return f"**{found[1]}** {found[2]}" if found else NOT_DRIVEN
 
 
@@ -58,11 +57,11 @@ def stale(claim: Claim, work: Work, out: Path) -> Iterator[str]:
     page, arms = out / f"{claim.name}.md", work.arms[claim.name]
     if answer(claim, out) != NOT_DRIVEN:
         if f"({claim.digest})" not in page.read_text(encoding="utf-8"):
-            yield f"{page}: made of another definition of the claim"
+            yield f"{page}: made from another definition of the claim"
         made = _made(out, claim.name)
         for condition, arm in arms:
             if (condition.scenario, condition.text, arm) not in made:
-                yield f"{page}: {arm} in {condition.scenario} is not there"
+                yield f"{page}: {arm} in {condition.scenario} is missing"
     for name in (claim.name, *SAMPLES.get(claim.name, ())):
         yield from _differing(out / f"{name}.md", _made(out, name), arms)
 
@@ -74,7 +73,7 @@ def _differing(page: Path, made: Mapping[Key, Mapping[str, str]], arms: Arms) ->
         if row is None:
             continue
         if row["weights"] != arm.weights:
-            yield f"{page}: {name} was driven by weights {row['weights']}, here are {arm.weights}"
+            yield f"{page}: {name} was driven with weights {row['weights']}, now they are {arm.weights}"
         elif row["definitions"] != arm.definitions:
             yield f"{page}: {name} in {condition.scenario} was driven with other files or settings"
 

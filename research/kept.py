@@ -23,9 +23,9 @@ from cosim.workers.tasks import OK
 
 FOLDER = Path("docs/results/episodes")
 ROWS, MANIFEST = "episodes.parquet", "manifest.json"
-LEVEL = 19  # of zstd: high, because files are rarely written
+ZSTD_LEVEL = 19  # high, because files are rarely written
 MARK = "#"  # between a policy's name and the hash of its definitions
-OF_THE_MACHINE = ("timings", "stderr", "attempts")  # and every timing: not reproducible
+MACHINE_COLUMNS = ("timings", "stderr", "attempts")  # not reproducible, like each column of `timings`
 
 
 def episodes(folder: Path | None) -> Run:
@@ -55,7 +55,7 @@ def take(store: Store, wanted: Mapping[str, Container[int]], folder: Path | None
 def keep(store: Store, wanted: Mapping[str, Container[int]], folder: Path) -> int:
     """Write the completed wanted episodes of the store; returns their number.
 
-    Kept episodes that are no longer wanted are removed; `opened` has copied the others into the store.
+    Kept episodes that are no longer wanted are removed. The store must hold the others (`drive.opened`).
     """
     rows = [row for row in store.rows() if row["status"] == OK and row["seed"] in wanted.get(row["cell"], ())]
     present, cells, document = {row["cell"] for row in rows}, store.cells(), store.document()
@@ -75,14 +75,14 @@ def write(rows: Sequence[Row], manifest: Mapping[str, Any], folder: Path) -> Non
     place = {name: k for k, name in enumerate(manifest["cells"])}
     table = arrow([plain(row) for row in sorted(rows, key=lambda r: (place[r["cell"]], r["seed"]))])
     with whole(folder / ROWS) as rows_draft, whole(folder / MANIFEST) as draft:
-        pyarrow.parquet.write_table(table, rows_draft, compression="zstd", compression_level=LEVEL)
+        pyarrow.parquet.write_table(table, rows_draft, compression="zstd", compression_level=ZSTD_LEVEL)
         draft.write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
 
 
 def plain(row: Row) -> dict[str, Any]:
-    """The row without machine-dependent columns: equal whenever it is driven again."""
+    """The row without machine-dependent columns, equal when the episode is driven again."""
     timings = json.loads(row.get("timings") or "{}")
-    return {name: value for name, value in row.items() if name not in (*OF_THE_MACHINE, *timings)}
+    return {name: value for name, value in row.items() if name not in (*MACHINE_COLUMNS, *timings)}
 
 
 def packages(versions: Mapping[str, str | None]) -> dict[str, str]:
@@ -91,7 +91,7 @@ def packages(versions: Mapping[str, str | None]) -> dict[str, str]:
 
 
 def unmarked(text: str) -> str:
-    """The name for `--policy` of a cell's policy."""
+    """The policy's name for `--policy`, without the mark and the hash."""
     return text.partition(MARK)[0]
 
 

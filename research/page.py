@@ -1,4 +1,4 @@
-"""A claim's page on one screen, its picture and its CSV."""
+"""The page of a claim, its picture and its CSV."""
 
 from __future__ import annotations
 
@@ -51,20 +51,21 @@ def lines(found: Found, settings: Settings) -> list[str]:
 
 
 def wrapped(text: str) -> list[str]:
-    """Lines of prose."""
+    """The text in lines of at most `WIDTH` columns."""
     return textwrap.wrap(text, WIDTH, break_long_words=False, break_on_hyphens=False)
 
 
 def verdict(found: Found) -> str:
-    """`**No.** ...`: the answer, the effect with its interval, and in how many comparisons."""
+    """`**No.** ...`: the answer, the effect with its interval, and the verdicts by condition."""
     claim = found.claim
     effects = [
-        f"less `{against}` {_difference(one)}, {one.n} pairs" for against, one in found.overall.items()
+        f"difference to `{against}` {_difference(one)}, {one.n} pairs"
+        for against, one in found.overall.items()
     ]
     counts = {word: sum(t.verdict == word for t in found.tested) for word in WORDS}
     parts = [f"{n} {word}" for word, n in counts.items() if n]
     return (
-        f"**{WORDS[found.verdict]}** {claim.source}. `{claim.primary.metric}` of `{claim.compare.arm}`: "
+        f"**{WORDS[found.verdict]}** Source: {claim.source}. `{claim.primary.metric}` of `{claim.compare.arm}`: "
         f"{'; '.join(effects)}. By condition: {', '.join(parts)}."
     )
 
@@ -74,21 +75,21 @@ def table(found: Found) -> list[str]:
     claim = found.claim
     primary = found.measures[claim.primary.metric]
     scenarios = list(dict.fromkeys(condition.scenario for condition, _ in found.arms))
-    heads = [_headed(primary, "%"), "n", "preset", "errors", "drivers", "weights", *scenarios]
+    heads = [_column_head(primary, "%"), "n", "preset", "errors", "drivers", "weights", *scenarios]
     rows = [heads, ["---"] * len(heads)]
     for values in dict.fromkeys(condition.values for condition, _ in found.arms):
         here = [Condition(scenario, values) for scenario in scenarios]
         if text := here[0].text:
             rows.append([f"**{text}**", *[""] * (len(heads) - 1)])
         for arm in claim.every_arm:
-            figures = (_own(found, condition, arm) for condition in here)
-            rows.append([_named(found, here[0], arm), *_about(found, here, arm), *figures])
+            figures = (_figure_cell(found, condition, arm) for condition in here)
+            rows.append([_arm_name(found, here[0], arm), *_arm_cells(found, here, arm), *figures])
         rows += _differences(found, here)
     return [f"| {' | '.join(row)} |" for row in rows]
 
 
 def conditions(found: Found, settings: Settings) -> str:
-    """Seeds, the paper's figures, and what is cut or lost."""
+    """Seeds, the paper's figures, shortened and failed episodes."""
     first = min(arm.seeds.start for arm in found.arms.values())
     failed = sum(row["status"] != OK for arm in found.arms.values() for row in arm.rows)
     parts = [f"All arms drive equal seeds from {first} on."]
@@ -102,22 +103,22 @@ def conditions(found: Found, settings: Settings) -> str:
 
 
 def tests(found: Found) -> str:
-    """How it was tested."""
+    """The paragraph on the statistical test."""
     claim = found.claim
     smallest = wording.number(claim.power.smallest, found.measures[claim.primary.metric], signed=True).lstrip(
         "+"
     )
     return (
-        f"Intervals are of 95 %. p is of {TESTS[claim.test]}, corrected by Holm's method "
+        f"Intervals are 95 %. p is from {TESTS[claim.test]}, corrected by Holm's method "
         f"(tests: {len(found.tested)}). "
-        f"A condition says yes where p is below 0.05 and the figure is {claim.primary.direction}, "
-        f"as claimed. It says no where the interval holds no effect of {smallest} or more that way. "
+        f"A condition says yes if p is below 0.05 and the figure is {claim.primary.direction}, as claimed. "
+        f"It says no if the interval excludes an effect of {smallest} or more in the claimed direction. "
         f"The claim must hold {claim.holds}."
     )
 
 
 def powered(found: Found) -> str:
-    """The power that the tests had."""
+    """The paragraph on the power of the tests."""
     known = [t.power for t in found.tested if not math.isnan(t.power)]
     span = f"{_span(round(100 * x) for x in known)} %" if known else "unknown"
     pairs = _span(t.found.n for t in found.tested)
@@ -126,7 +127,7 @@ def powered(found: Found) -> str:
 
 
 def flags(settings: Settings) -> str:
-    """As they were typed, where they decide what the page shows."""
+    """The command's flags that affect the page."""
     default = Settings()
     words = [] if settings.scale == default.scale else [f"--scale {settings.scale:g}"]
     words += [f"--seeds {s.start}:{s.stop}" for s in [settings.seeds] if s is not None]
@@ -137,7 +138,7 @@ def flags(settings: Settings) -> str:
 
 
 def write_csv(path: Path, found: Iterable[Line]) -> None:
-    """NA is empty."""
+    """Write the figures as CSV; NA is an empty cell."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with whole(path) as draft, draft.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
@@ -148,18 +149,18 @@ def write_csv(path: Path, found: Iterable[Line]) -> None:
 # ---- inside ----
 
 
-def _named(found: Found, condition: Condition, name: str) -> str:
+def _arm_name(found: Found, condition: Condition, name: str) -> str:
     label = found.arms[condition, name].label
     return f"{name} ({label})" if label else name
 
 
-def _about(found: Found, here: Sequence[Condition], name: str) -> list[str]:
+def _arm_cells(found: Found, here: Sequence[Condition], name: str) -> list[str]:
     arm = found.arms[here[0], name]
     count = _span(len(found.arms[c, name].rows) for c in here)
     return [count, *traffic_of(arm), arm.weights or "-"]
 
 
-def _own(found: Found, condition: Condition, name: str) -> str:
+def _figure_cell(found: Found, condition: Condition, name: str) -> str:
     """`2.3 % (1.1 to 4.7)`, and the paper's figure in brackets."""
     measure = found.measures[found.claim.primary.metric]
     text = wording.interval(found.figure(condition, name, measure.name), measure, unit=False)
@@ -170,15 +171,15 @@ def _own(found: Found, condition: Condition, name: str) -> str:
 def _differences(found: Found, here: Sequence[Condition]) -> Iterator[list[str]]:
     """Rows of the primary figure against each arm, and of the secondary ones against the first."""
     claim = found.claim
-    _, *about = _about(found, here, claim.compare.arm)
+    _, *about = _arm_cells(found, here, claim.compare.arm)
     for against in claim.compare.against:
         tested = [t for c in here for t in found.tested if (t.condition, t.against) == (c, against)]
         texts = [f"{_difference(t.found, False)}, {wording.p_value(t.p_holm)}: {t.verdict}" for t in tested]
-        yield [f"less {against}", _span(t.found.n for t in tested), *about, *texts]
+        yield [f"difference to {against}", _span(t.found.n for t in tested), *about, *texts]
     first = claim.compare.against[0]
     for metric in claim.secondary:
         pairs = [found.difference(condition, first, metric) for condition in here]
-        name = f"{_headed(found.measures[metric], 'pp')}, less {first}"
+        name = f"{_column_head(found.measures[metric], 'pp')}, difference to {first}"
         yield [name, _span(p.n for p in pairs), *about, *(_difference(p, False) for p in pairs)]
 
 
@@ -186,7 +187,7 @@ def _difference(one: PairedFigure, unit: bool = True) -> str:
     return wording.interval(one.difference, one.measure, signed=True, unit=unit)
 
 
-def _headed(measure: Measure, share: str) -> str:
+def _column_head(measure: Measure, share: str) -> str:
     unit = share if measure.is_share else measure.unit
     return f"{measure.name}, {unit}" if unit else measure.name
 

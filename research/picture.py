@@ -16,7 +16,7 @@ from cosim.report.statistics import Figure
 from research.evaluate import Found
 from research.schema import Condition
 
-PER_CENT = (0.0, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
+TICKS = (0.0, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # %
 STYLE: Any = {"svg.fonttype": "none", "svg.hashsalt": "cosim", "font.size": 9.0}  # equal figures, equal file
 
 
@@ -26,7 +26,7 @@ def draw(found: Found, path: Path) -> None:
 
 
 def save(picture: Picture, path: Path) -> None:
-    """Write it as SVG, the same for the same figures."""
+    """Write the picture as SVG; equal figures give an equal file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with rc_context(STYLE):
         picture.savefig(path, metadata={"Date": None, "Creator": None})
@@ -60,10 +60,10 @@ def _points(found: Found) -> Picture:
                 if (published := found.claim.published.get(scenario, {}).get(arm)) is not None:
                     axes.plot(x + shift, published, "x", ms=4, color="0.4")
         axes.set_xticks(range(len(scenarios)), scenarios, rotation=20)
-        axes.set(title=Condition("", values).text, ylabel=_named(measure))
-        if measure.is_share and measure.better == "lower":  # 1 % against 2 %, beside 60 %
+        axes.set(title=Condition("", values).text, ylabel=_axis_label(measure))
+        if measure.is_share and measure.better == "lower":  # separates 1 % from 2 % on an axis to 100 %
             axes.set_yscale("symlog", linthresh=1.0)
-            axes.set_yticks(PER_CENT, [f"{tick:g}" for tick in PER_CENT])
+            axes.set_yticks(TICKS, [f"{tick:g}" for tick in TICKS])
             axes.set_ylim(-0.1, 110.0)
         axes.grid(axis="y", alpha=0.3)
     picture.legend(loc="outside right upper", fontsize="small")
@@ -90,7 +90,7 @@ def _front(found: Found) -> Picture:
                     label=arm if (y, condition) == (others[0], conditions[0]) else None,
                 )  # fmt: skip
             title = ", ".join(filter(None, (condition.scenario, condition.text)))
-            axes.set(title=title if y == others[0] else "", xlabel=_named(x), ylabel=_named(y))
+            axes.set(title=title if y == others[0] else "", xlabel=_axis_label(x), ylabel=_axis_label(y))
             axes.grid(alpha=0.3)
     picture.legend(loc="outside right upper", fontsize="small")
     return picture
@@ -102,9 +102,9 @@ def _axes(picture: Picture, rows: int, columns: int) -> Sequence[Sequence[Axes]]
 
 
 def _bars(one: Figure) -> Any:
-    """[2,1] the lengths of the bars; 0 where there is no interval."""
+    """[2,1] the lengths of the error bars; 0 without an interval."""
     return np.nan_to_num([[one.value - one.low], [one.high - one.value]]).clip(0.0)
 
 
-def _named(measure: Measure) -> str:
+def _axis_label(measure: Measure) -> str:
     return f"{measure.name}, {'%' if measure.is_share else measure.unit}".rstrip(", ")

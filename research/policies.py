@@ -1,4 +1,4 @@
-"""Policies that claims alone compare (`LABEL=research.policies:NAME`): the mask without a network."""
+"""Policies for comparisons in claims (`LABEL=research.policies:NAME`): the safety mask without a network."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from policy.inputs.tensors import States, svo_tensor
 
 
 class MaskOnly(PredictionAware):
-    """All actions are worth the same: an AV keeps lane and speed while that is safe, and picks up speed when
-    it has become slow (the prioritizer's order of equal values). Without a mask this is `keep-lane`.
+    """All actions have equal values, without a network or maps.
 
-    No network is asked, no map drawn.
+    An AV keeps lane and speed while that is safe, and speeds up again after slowing down: the prioritizer's
+    order of equal values. Without a mask this is `keep-lane`.
     """
 
     def __init__(self, name: str, config: AgentConfig) -> None:
@@ -26,13 +26,13 @@ class MaskOnly(PredictionAware):
         self.label = ""
 
     def perceive(self, histories: Mapping[str, History]) -> Inputs:
-        """What the prioritizer needs."""
+        """The prioritizer's inputs; those of a network are empty."""
         scene, traffic, _ = self.foresee(histories)
         none = svo_tensor(0.0, 0)
         return Inputs(scene, States(none, none, none, none), traffic)
 
     def values(self, inputs: Inputs) -> Floats32:
-        """All alike."""
+        """[agents, actions] zeros; without a mask 1 for IDLE."""
         q = np.zeros((len(inputs.scene.agents), len(MetaAction)), np.float32)
         if not self.config.mask:
             q[:, MetaAction.IDLE] = 1.0

@@ -23,9 +23,9 @@ from cosim.scenario import with_preset
 from cosim.scenario.options import OPTIONS, EpisodeOptions
 
 FOLDER = Path(__file__).parent / "claims"
-FIRST_SEED = 300_000  # earlier test seeds were seen before the networks were trained
+FIRST_SEED = 300_000  # lower test seeds had been used before the networks were trained
 SCENARIO, POLICY = "scenario", "policy"
-OF_AN_ARM = tuple(name for name in OPTIONS if name != SCENARIO)  # options that a claim may set
+ARM_OPTIONS = tuple(name for name in OPTIONS if name != SCENARIO)  # options that a claim may set
 
 
 class Condition(NamedTuple):
@@ -101,7 +101,7 @@ class Claim:
     floors: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # additional arms without a test
     secondary: tuple[str, ...] = ()  # metrics
     published: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # scenario -> arm -> value
-    front: tuple[str, ...] = ()  # metrics: the picture draws each of the others against the first
+    front: tuple[str, ...] = ()  # metrics: the picture plots the others against the first
     note: str = ""  # a remark for the page
 
     def __post_init__(self) -> None:
@@ -140,7 +140,7 @@ class Claim:
 
     @cached_property
     def cases(self) -> dict[tuple[Condition, str], EpisodeOptions]:
-        """What every arm drives in every condition; the seed is the first one."""
+        """The options of every arm in every condition, with the first seed."""
         return {
             (condition, arm): self._case(condition, arm)
             for condition in self.conditions
@@ -156,18 +156,18 @@ class Claim:
 
     def _check_seeds(self) -> None:
         if self.seeds.first < FIRST_SEED:
-            problem = f"claims are judged on seeds from {FIRST_SEED} on"
+            problem = f"the seeds of a claim start at {FIRST_SEED} or above"
             raise BadInput(problem, field="seeds.first", value=self.seeds.first)
-        fewest = min(self.seeds.count, *self.seeds.more.values(), self.seeds.count)
+        fewest = min([self.seeds.count, *self.seeds.more.values()])
         if not 0 < self.power.pairs <= fewest:
-            problem = f"more than 0 and at most the {fewest} seeds are needed"
+            problem = f"must be between 1 and {fewest}, the number of seeds"
             raise BadInput(problem, field="power.pairs", value=self.power.pairs)
 
     def _case(self, condition: Condition, arm: str) -> EpisodeOptions:
         kind = "arms" if arm in self.arms else "floors"
         own = self.every_arm[arm]
         if twice := own.keys() & self.matrix.keys():
-            raise BadInput("is in the matrix", field=f"{kind}.{arm}.{min(twice)}")
+            raise BadInput("is set by the matrix already", field=f"{kind}.{arm}.{min(twice)}")
         parts = {"options": self.options, "matrix": dict(condition.values), f"{kind}.{arm}": own}
         values = {
             name: value for place, given in parts.items() for name, value in _read(given, place).items()
@@ -201,7 +201,7 @@ def chosen(wanted: Iterable[str], folder: Path = FOLDER) -> Iterator[Claim]:
 def _read(given: Mapping[str, Any], place: str) -> dict[str, Any]:
     """Fields of `EpisodeOptions` from what the file says under `place`."""
     with inside(place):
-        check_known(given, OF_AN_ARM)
+        check_known(given, ARM_OPTIONS)
         found = {OPTIONS[name].field: OPTIONS[name].read(v, FOLDER, name) for name, v in given.items()}
         if POLICY in given:
             check(given[POLICY], POLICY)

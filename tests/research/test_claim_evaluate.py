@@ -77,7 +77,7 @@ def test_a_mean_is_tested_by_signed_ranks(tmp_path: Path) -> None:
     one = found(tmp_path, farther, farther, **changes)
     assert one.verdict == "yes"
     assert one.overall["idm"].difference.value == pytest.approx(10.0)
-    with pytest.raises(BadInput, match="test='mcnemar': dt_mean_m is no share of episodes"):
+    with pytest.raises(BadInput, match="test='mcnemar': dt_mean_m is not a share of episodes"):
         found(tmp_path, farther, farther, **{**changes, "test": "mcnemar"})
 
 

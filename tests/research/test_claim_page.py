@@ -33,7 +33,7 @@ def test_the_verdict_stands_first_with_effect_interval_and_pairs(found: Found) -
     assert lines[0] == f"# {SMALL['sentence']}"
     text = " ".join(lines[2:5])
     assert text.startswith(
-        "**Yes.** ours. `collision_rate` of `rule`: less `idm` -25.0 pp (-28.1 to -22.1), 800"
+        "**Yes.** Source: ours. `collision_rate` of `rule`: difference to `idm` -25.0 pp (-28.1 to -22.1), 800"
     )
     assert "By condition: 2 yes." in text
 
@@ -47,7 +47,7 @@ def test_the_table_has_a_row_for_every_arm_and_difference(found: Found) -> None:
     assert rows[3].startswith("| idm | 400 | unguarded | stress | mixed | - | 25.0 (21.0 to 29.5)")
     assert rows[4].startswith("| lane | 40 |")
     assert rows[5].endswith("p < 0.001: yes |")
-    assert rows[6].startswith("| dt_mean_m, m, less idm | 400 |")
+    assert rows[6].startswith("| dt_mean_m, m, difference to idm | 400 |")
 
 
 def test_it_says_conditions_tests_power_and_the_command(found: Found) -> None:
@@ -55,7 +55,7 @@ def test_it_says_conditions_tests_power_and_the_command(found: Found) -> None:
     assert "A note." in text
     assert "Brackets and crosses are the paper's figures." in text
     assert "**Episodes are cut to 2 s.**" in text
-    assert "no effect of 10 pp or more that way" in text
+    assert "excludes an effect of 10 pp or more in the claimed direction" in text
     assert "Power to find the smallest effect of interest: 99 % (400 pairs a test," in text
     assert "`python -m research page small --scale 0.5 --duration 2` from" in text
 
@@ -85,7 +85,7 @@ def test_the_index_has_a_line_for_every_claim_and_says_what_is_not_driven(
     page.write(found, Settings(), tmp_path)
     text = index.write([found.claim, other], tmp_path).read_text()
     assert (
-        f"| {SMALL['sentence']} | ours | **Yes.** less `idm` -25.0 pp (-28.1 to -22.1), 800 pairs "
+        f"| {SMALL['sentence']} | ours | **Yes.** difference to `idm` -25.0 pp (-28.1 to -22.1), 800 pairs "
         "| [small](small.md) |" in text
     )
     assert "| Nobody drove this | ours | Not driven yet. |  |" in text
@@ -101,11 +101,11 @@ def test_a_page_of_other_weights_files_or_definition_is_found(found: Found, tmp_
 
     assert stale() == []
     assert [line.split(": ", 1)[1] for line in stale(weights="fedcba987654")] == [
-        "rule was driven by weights 0123456789ab, here are fedcba987654"
+        "rule was driven with weights 0123456789ab, now they are fedcba987654"
     ] * 2
     assert "rule in exit was driven with other files or settings" in stale(definitions="others")[1]
     assert stale(replace(found.claim, holds="somewhere")) == [
-        f"{tmp_path / 'small.md'}: made of another definition of the claim"
+        f"{tmp_path / 'small.md'}: made from another definition of the claim"
     ]
     (tmp_path / "small.md").write_text("# By another program\n")
     (tmp_path / "data" / "small.csv").write_text("scenario,arm,against,figure\nmerge,rule,,collision_rate\n")

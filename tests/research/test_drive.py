@@ -130,7 +130,7 @@ def test_a_page_that_lacks_episodes_is_left_as_it_is(
 ) -> None:
     flags = ["--claims", str(folder), "--runs", str(settings.runs), "--out", str(tmp_path), "--anew"]
     assert cli.main(["page", "first", *flags, "--seeds", "150000:150003", "--duration", "2"]) == 0
-    assert "first: left as it is: 3 episodes are not driven" in capsys.readouterr().err
+    assert "first: page unchanged: 3 episodes are missing" in capsys.readouterr().err
     assert not (tmp_path / "first.md").exists()
     assert "Not driven yet." in (tmp_path / "README.md").read_text()
 

@@ -65,7 +65,8 @@ def verdict(found: Found) -> str:
     counts = {word: sum(t.verdict == word for t in found.tested) for word in WORDS}
     parts = [f"{n} {word}" for word, n in counts.items() if n]
     return (
-        f"**{WORDS[found.verdict]}** Source: {claim.source}. `{claim.primary.metric}` of `{claim.compare.arm}`: "
+        f"**{WORDS[found.verdict]}** Source: {claim.source}. "
+        f"`{claim.primary.metric}` of `{claim.compare.arm}`: "
         f"{'; '.join(effects)}. By condition: {', '.join(parts)}."
     )
 

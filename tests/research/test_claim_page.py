@@ -33,7 +33,7 @@ def test_the_verdict_stands_first_with_effect_interval_and_pairs(found: Found) -
     assert lines[0] == f"# {SMALL['sentence']}"
     text = " ".join(lines[2:5])
     assert text.startswith(
-        "**Yes.** Source: ours. `collision_rate` of `rule`: difference to `idm` -25.0 pp (-28.1 to -22.1), 800"
+        "**Yes.** Source: ours. `collision_rate` of `rule`: difference to `idm` -25.0 pp (-28.1 to -22.1)"
     )
     assert "By condition: 2 yes." in text
 

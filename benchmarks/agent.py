@@ -154,7 +154,7 @@ def training(config: str, lesson: Lesson, episodes: int) -> dict[str, float]:
 
 
 def figure(one: DriveResult, name: str) -> float:
-    """A figure present in every drive."""
+    """The value of a figure that every drive has."""
     value = one.figures[name]
     assert value is not None
     return value
@@ -162,7 +162,7 @@ def figure(one: DriveResult, name: str) -> float:
 
 def page(found: Mapping[str, Any], command: str) -> list[str]:
     """The Markdown page."""
-    lines = ["# What the agent costs", "", f"Made by `{command}`; tuning seeds.", ""]
+    lines = ["# What the agent costs", "", f"Made by `{command}`; validation seeds.", ""]
     if found["decisions"]:
         lines += [
             f"One joint decision for {AGENTS} AVs, ms, median; the period is {1e3 * DECISION:g} ms.",
@@ -174,7 +174,9 @@ def page(found: Mapping[str, Any], command: str) -> list[str]:
         for size, by_threads in found["decisions"].items():
             for threads, parts in by_threads.items():
                 times = [f"{parts[name]:.1f}" for name in columns]
-                result = verdict(parts["decision"], TARGET_MS, most=True) if size == "compact" else "measured"
+                result = (
+                    verdict(parts["decision"], TARGET_MS, at_most=True) if size == "compact" else "measured"
+                )
                 lines.append(markdown_row([size, str(threads), *times, result]))
         lines += [""]
     if found["closed loop"]:
@@ -182,7 +184,7 @@ def page(found: Mapping[str, Any], command: str) -> list[str]:
         lines += ["Whole episodes in one process, ms a decision (compact, one thread): "]
         lines += [", ".join(f"{name} {value:.1f}" for name, value in parts.items()) + ".", ""]
     for config, rates in found["training"].items():
-        rate = verdict(rates["joint decisions/s"], TARGET_RATE, most=False)
+        rate = verdict(rates["joint decisions/s"], TARGET_RATE, at_most=False)
         rate_shown = "measured" if config == "paper" else rate
         lines += [
             f"Training, `{config}`, a rollout process beside the learner (joint decisions/s: {rate_shown}):",
@@ -199,10 +201,10 @@ def rate_text(value: float) -> str:
     return f"{value:,.0f}" if value == round(value) or value >= 1000.0 else f"{value:.3g}"
 
 
-def verdict(value: float, limit: float, *, most: bool) -> str:
+def verdict(value: float, limit: float, *, at_most: bool) -> str:
     """Whether a target is met."""
-    met = value <= limit if most else value >= limit
-    return f"{'met' if met else '**missed**'} ({'at most' if most else 'at least'} {limit:g})"
+    met = value <= limit if at_most else value >= limit
+    return f"{'met' if met else '**missed**'} ({'at most' if at_most else 'at least'} {limit:g})"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -213,9 +215,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--decisions", type=int, default=40)
     parser.add_argument("--bf16", action="store_true", help="networks in bfloat16")
     parser.add_argument("--episodes", type=int, default=4, help="whole episodes, to drive and to train")
-    parser.add_argument("--config", nargs="+", default=["compact"], help="of the training: a name or a file")
-    parser.add_argument("--scenario", default="merge", help="of the training")
-    parser.add_argument("--demand", default="contested", help="of the training")
+    parser.add_argument(
+        "--config", nargs="+", default=["compact"], help="training configuration: name or file"
+    )
+    parser.add_argument("--scenario", default="merge", help="training scenario")
+    parser.add_argument("--demand", default="contested", help="training demand")
     parser.add_argument("--only", choices=("decision", "loop", "training"))
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--out", type=Path, metavar="FILE.md")

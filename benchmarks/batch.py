@@ -29,8 +29,8 @@ from cosim.batch.store import Store
 from cosim.workers.engines import LocalEngine
 from cosim.workers.progress import Progress
 
-GAIN = 0.6  # target: largest time of two workers, as a share of the time of one
-OVERHEAD = 0.05  # target: largest share of the serial time
+MAX_RATIO = 0.6  # target: time of two workers, as a share of the time of one
+MAX_OVERHEAD = 0.05  # target: share of the serial time
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,8 @@ def measured(plan: matrix.Plan, workers: int, progress: Progress) -> Run:
         batch.drive(plan, store, LocalEngine(EpisodeRunner, workers=workers), Path(folder), arrived)
         wall = time.perf_counter() - began
         rows = store.rows()
-    if any(row["status"] != "ok" for row in rows):
-        raise SystemExit(f"not all episodes came through: {rows[0]['error']}")
+    if failed := [row for row in rows if row["status"] != "ok"]:
+        raise SystemExit(f"{len(failed)} episodes failed: {failed[0]['error']}")
     episodes = tuple(row["total_s"] for row in rows)
     start = arrivals[0] - began - episodes[0]
     busy = sum(episodes) / (workers * (wall - start))
@@ -92,7 +92,7 @@ def main() -> None:
                 flush=True,
             )
     one, two = (sum(r.wall for r in runs[n]) for n in (1, 2))
-    gain = two / one
+    ratio = two / one
     overhead = sum(r.between for r in runs[1]) / sum(sum(r.episodes[1:]) for r in runs[1]) - 1.0
     if args.json:
         result = {
@@ -100,17 +100,17 @@ def main() -> None:
             "episode_s": statistics.median(s for r in runs[1] for s in r.episodes),
             "one_worker_s": one,
             "two_workers_s": two,
-            "ratio": gain,
-            "target": GAIN,
+            "ratio": ratio,
+            "target": MAX_RATIO,
             "overhead": overhead,
-            "overhead_target": OVERHEAD,
+            "overhead_target": MAX_OVERHEAD,
             "start_s": statistics.median(r.start for r in runs[1]),
         }
         print(json.dumps(result))
         return
     print(f"{args.rounds * args.episodes} episodes: {one:.0f} s with one worker, {two:.0f} s with two")
-    print(f"two workers take {gain:.2f} of the time of one (at most {GAIN})")
-    print(f"the engine costs {overhead:.2%} of the serial time (at most {OVERHEAD:.0%})")
+    print(f"two workers take {ratio:.2f} of the time of one (at most {MAX_RATIO})")
+    print(f"the engine costs {overhead:.2%} of the serial time (at most {MAX_OVERHEAD:.0%})")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Fidelity of SUMO's LC2013 to Table II: comparison with cosim's MOBIL, and calibration to it.
 
 python -m benchmarks.behaviors --report      # test seeds; rewrites docs/results/behaviors.md
-python -m benchmarks.behaviors --calibrate   # tuning seeds; rewrites lc2013 in behaviors.yaml
+python -m benchmarks.behaviors --calibrate   # validation seeds; rewrites lc2013 in behaviors.yaml
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ def calibrate(
             return {k: round(10.0**v if k == "lcSpeedGain" else v, 3) for k, v in values.items()}
 
         def objective(x: npt.NDArray[np.float64], /, *_: object) -> float:
-            return loss(evaluate(name, LC2013, decode(x)), wanted, b_safe, least_share)  # noqa: B023  used in this turn
+            return loss(evaluate(name, LC2013, decode(x)), wanted, b_safe, least_share)  # noqa: B023  called in this iteration only
 
         start = FORMULAS[name]
         x0 = np.array([math.log10(start["lcSpeedGain"]), start["lcSpeedGainLookahead"]])
@@ -184,10 +184,12 @@ def report(folder: Path, scale: float) -> str:
 
     rows: list[tuple[str, str, str, Traffic]] = []
     for name in CLASSES:
-        rows.append((name, name, "MOBIL", collect(name, MOBIL, behaviors)))
-        rows.append((name, name, "LC2013", collect(name, LC2013, behaviors)))
         formulas = with_attributes(behaviors, name, FORMULAS[name])
-        rows.append((name, name, "LC2013, formulas", collect(name, LC2013, formulas)))
+        rows += [
+            (name, name, "MOBIL", collect(name, MOBIL, behaviors)),
+            (name, name, "LC2013", collect(name, LC2013, behaviors)),
+            (name, name, "LC2013, formulas", collect(name, LC2013, formulas)),
+        ]
     polite = with_attributes(behaviors, "conservative", {"lcAssertive": 0.5, "lcSpeedGain": 10.0})
     rows.append(
         ("conservative", "conservative", "LC2013, lcAssertive 0.5", collect("conservative", LC2013, polite))
@@ -228,7 +230,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--report", action="store_true", help="measure on test seeds, rewrite the tables")
-    what.add_argument("--calibrate", action="store_true", help="fit LC2013 to MOBIL on tuning seeds")
+    what.add_argument("--calibrate", action="store_true", help="fit LC2013 to MOBIL on validation seeds")
     parser.add_argument("--classes", nargs="+", choices=CLASSES, default=CLASSES, help="classes to fit")
     parser.add_argument(
         "--cache",
@@ -236,7 +238,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         default=Path(tempfile.gettempdir()) / "cosim_behaviors_calibration.json",
         help="evaluations so far, to continue an interrupted fit; delete it after a change of the code",
     )
-    parser.add_argument("--population", type=int, default=5, help="of differential evolution, per parameter")
+    parser.add_argument("--population", type=int, default=5, help="per parameter, of differential evolution")
     parser.add_argument("--generations", type=int, default=2)
     parser.add_argument("--scale", type=float, default=1.0, help="factor on the report's simulated time")
     parser.add_argument("--out", type=Path, metavar="FILE.md", help="the page, with new tables (in place)")

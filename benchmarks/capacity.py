@@ -251,13 +251,13 @@ def page(rows: Sequence[Minute], picture: str) -> str:
 
 def cells(rows: Sequence[Minute], name: str) -> list[str]:
     """The cells of one road."""
-    most = [before(one) for one in drives(rows, name, RISING)]
+    largest = [before(one) for one in drives(rows, name, RISING)]
     discharge = [flow for one in drives(rows, name, OVER) if (flow := after(one)) is not None]
     found = capacity(rows, name)
     dropped = f"{100.0 * (1.0 - fmean(discharge) / found):.0f}" if discharge else "-"
     return [
         f"{found:,.0f}",
-        f"{stdev(most):,.0f}" if len(most) > 1 else "-",
+        f"{stdev(largest):,.0f}" if len(largest) > 1 else "-",
         _broken(rows, name, RISING),
         f"{fmean(discharge):,.0f}" if discharge else "-",
         dropped,
@@ -296,8 +296,8 @@ COLUMNS = (
 )
 WORDS = """# Capacity of the open roads
 
-What human drivers bring through each open road, without any AV. The demands of the roads are shares
-of it.
+The largest flow of human drivers on each open road, without any AV. The demands of the roads are
+shares of this capacity.
 
 {table}
 
@@ -322,9 +322,9 @@ Vehicles per hour, for 15 minutes:
 
 ## Conditions
 
-Drivers `moderate` (IDM, LC2013), no driver errors, validation seeds from 100,000. A drop below 0 says
-that more passed after the breakdown than before it: no capacity drop is shown there. Each drive is one
-seed, and seeds scatter. Rows by minute: [data/capacity.csv](data/capacity.csv). To measure again:
+Drivers `moderate` (IDM, LC2013), no driver errors, validation seeds from 100,000. A drop below 0
+means a larger flow after the breakdown than before it, so there is no capacity drop. Each drive is
+one seed, and seeds scatter. Rows by minute: [data/capacity.csv](data/capacity.csv). To measure again:
 `python -m benchmarks.capacity --again`, with more seeds: `--seeds A:B`.
 """
 
@@ -337,7 +337,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     first = TUNING_SEEDS.start
     parser.add_argument("--roads", nargs="*", default=[*NAMED], choices=[*NAMED], metavar="NAME")
     parser.add_argument("--seeds", default=f"{first}:{first + 3}", metavar="A:B")
-    parser.add_argument("--again", action="store_true", help="also roads that have been measured")
+    parser.add_argument("--again", action="store_true", help="also measure finished roads")
     parser.add_argument("--out", type=Path, default=RESULTS, metavar="FOLDER")
     args = parser.parse_args(arguments)
     data = args.out / DATA

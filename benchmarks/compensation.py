@@ -54,16 +54,16 @@ class Drive(NamedTuple):
     humans: frozenset[str]
 
 
-class Sometimes:
-    """A `cosim.types.Compensator` that calls another one only while `asked`, to save time between samples."""
+class SampledCompensator:
+    """A `cosim.types.Compensator` that calls another one only while `sampling`, to save time."""
 
-    asked = False
+    sampling = False
 
     def __init__(self, compensator: Compensator) -> None:
         self._compensator, self.frames = compensator, compensator.frames
 
     def present(self, tracks: Tracks) -> Floats:
-        return self._compensator.present(tracks) if self.asked else tracks.state[:, -1]
+        return self._compensator.present(tracks) if self.sampling else tracks.state[:, -1]
 
 
 class Frames(Hook):
@@ -112,22 +112,22 @@ def _with_avs(frame: Snapshot, avs: set[str]) -> Snapshot:
 def errors(drive: Drive, level: Parameters) -> Floats:
     """[k,2] m and m/s, errors of position and speed of human-driven vehicles, once a second."""
     how = level.compensation
-    made = Sometimes(compensator(how, drive.road, drive.timing)) if how in PREDICTED else None
+    made = SampledCompensator(compensator(how, drive.road, drive.timing)) if how in PREDICTED else None
     perception = Perception(drive.road, level, drive.timing, drive.seed, made)
     found = []
     for k, frame in enumerate(drive.frames):
-        looked_at = k >= SKIPPED and k % EVERY == 0
+        sampled = k >= SKIPPED and k % EVERY == 0
         if made is not None:
-            made.asked = looked_at
+            made.sampling = sampled
         percepts = perception.perceive(frame)
-        if not looked_at:
+        if not sampled:
             continue
         for percept in percepts.values():
             world = percept.world
             rows = [(r, frame.row[i]) for i, r in world.row.items() if i in drive.humans and i in frame.row]
-            mine, real = np.array(rows, np.int64).reshape(-1, 2).T
-            away = np.hypot(world.x[mine] - frame.x[real], world.y[mine] - frame.y[real])
-            found.append(np.stack([away, np.abs(world.speed[mine] - frame.speed[real])], 1))
+            seen, real = np.array(rows, np.int64).reshape(-1, 2).T
+            distance = np.hypot(world.x[seen] - frame.x[real], world.y[seen] - frame.y[real])
+            found.append(np.stack([distance, np.abs(world.speed[seen] - frame.speed[real])], 1))
     return np.concatenate(found) if found else np.zeros((0, 2))
 
 
@@ -148,7 +148,7 @@ def interval(means: Floats) -> str:
 
 def table(drives: Sequence[Drive]) -> list[str]:
     """The tables of one scenario: mean distance and 99th percentile."""
-    head = [markdown_row(["knowledge", *COMPENSATIONS]), markdown_row(["---"] * (1 + len(COMPENSATIONS)))]
+    head = [markdown_row(["sensing", *COMPENSATIONS]), markdown_row(["---"] * (1 + len(COMPENSATIONS)))]
     means, tails = list(head), list(head)
     for name, level in conditions():
         each = [
@@ -163,17 +163,17 @@ def table(drives: Sequence[Drive]) -> list[str]:
 def page(numbers: Sequence[int], duration: float, scenarios: Sequence[str]) -> list[str]:
     """The Markdown page."""
     lines = [
-        "# What late knowledge is worth when it is predicted to now",
+        "# Errors of delayed positions with latency compensation",
         "",
         f"Made by `python -m benchmarks.compensation --seeds {numbers[0]}:{numbers[-1] + 1}`.",
         "",
-        "How wrong an AV is about a human driver's vehicle, by the `compensation` of its",
-        "[sensing](../reference/sensing.md). Demand contested, behavior mixed, 40 % AVs.",
-        f"`{POLICY}` drives, {len(numbers)} episodes of {duration:g} s a scenario; all compensations see the",
-        "same frames. One AV perceives. With 95 % intervals over episodes.",
+        "The distance between the perceived and the true position of a human-driven vehicle, by the",
+        "`compensation` of the AV's [sensing](../reference/sensing.md). Demand contested, behavior mixed,",
+        f"40 % AVs. `{POLICY}` drives {len(numbers)} episodes of {duration:g} s per scenario. All",
+        "compensations get the same frames, and one AV perceives. Intervals are 95 %, over episodes.",
         "",
-        "The first rows have own sensors that see everybody, late and without noise. `v2v` has noise, losses",
-        "and a line of sight. The last row has messages alone, all vehicles equipped.",
+        "In the first rows the AV's own sensors see all vehicles, late and without noise. `v2v` has noise,",
+        "losses and a line of sight. The last row has messages only, and all vehicles are equipped.",
     ]
     for scenario in scenarios:
         lines += ["", f"## {scenario}", "", *table(driven(scenario, numbers, duration))]
@@ -184,7 +184,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--seeds", type=seeds, default=range(100_000, 100_003))
-    parser.add_argument("--small", action="store_true", help="one short episode, the merge alone")
+    parser.add_argument("--small", action="store_true", help="one short episode, only the merge")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args(arguments)
     numbers, duration = (args.seeds[:1], SMALL) if args.small else (args.seeds, DURATION)

@@ -47,7 +47,7 @@ WARM_UP = 90.0  # s, after which all vehicles have departed and queues stand at 
 INSERTED = 60.0  # s, period of departures
 UNCOUNTED = 5  # decisions, for the compilation of kernels and caches
 SVO = math.radians(45.0)
-MOST_AVS = 100  # on the road, up to which A10KW has to run in real time
+MAX_AVS = 100  # on the road, up to which A10KW has to run in real time
 DECIDING = ("prediction", "values", "prioritizer")
 PARTS = ("simulation", "figures", "observing", *DECIDING)
 
@@ -171,13 +171,13 @@ class Driven:
 class Real(Driven):
     """Executes the policy's decisions and times whole runs."""
 
-    def drive(self, seed: int, most: int) -> dict[str, float]:
-        """Drive to the end, or until more than `most` AVs are on the road: simulated s and wall s."""
+    def drive(self, seed: int, max_avs: int) -> dict[str, float]:
+        """Drive to the end, or until more than `max_avs` AVs are on the road: simulated s and wall s."""
         host = self._host
         times: list[tuple[int, float]] = []  # AVs, wall s
         host.policy.reset(host.episode.context(seed, SVO))
         histories = host.episode.start(seed)
-        while len(histories) <= most and not host.episode.truncated:
+        while len(histories) <= max_avs and not host.episode.truncated:
             began = time.perf_counter()
             histories = host.episode.advance(host.policy.decide(histories))
             times.append((len(histories), time.perf_counter() - began))
@@ -210,7 +210,7 @@ def real() -> dict[str, float]:
     """A10KW with one AV per `SHARE` vehicles, driven by the policy."""
     scenario = vetted(load(str(a10kw()), fleet=Fleet(penetration=1 / SHARE)))
     with Worker(Real, scenario) as worker:
-        found: dict[str, float] = worker.call("drive", TUNING_SEEDS.start, MOST_AVS)
+        found: dict[str, float] = worker.call("drive", TUNING_SEEDS.start, MAX_AVS)
     return found
 
 
@@ -222,11 +222,11 @@ def page(found: Mapping[str, Any], command: str) -> list[str]:
         "",
         f"Made by `{command}`.",
         "",
-        f"`{POLICY}` on one thread, in a grid of {GRID} x {GRID} signalised junctions {BLOCK:g} m apart, two",
-        f"lanes a way, one vehicle in {SHARE} an AV. Medians over decisions, ms **per AV**, of wall time;",
-        "`decision` is prediction, values and prioritizer, what `policy.decide` does, also as a share of the",
-        "reference (a fixed piece of work timed between decisions) and in processor time, which other work",
-        "on the machine hardly changes: the target is for that.",
+        f"`{POLICY}` on one thread, in a grid of {GRID} x {GRID} signalised junctions {BLOCK:g} m apart. Roads",
+        f"have two lanes per direction, and one vehicle in {SHARE} is an AV. Values are medians over decisions",
+        "in ms of wall time **per AV**. `decision` is all of `policy.decide`: prediction, values and",
+        "prioritizer. It is also given as a share of the reference, a fixed piece of work timed between",
+        "decisions. The target is for `processor`, the processor time, which other load hardly changes.",
         "",
         markdown_row(heads),
         "|---" * len(heads) + "|",
@@ -244,7 +244,7 @@ def page(found: Mapping[str, Any], command: str) -> list[str]:
             "## A real interchange",
             "",
             f"A10KW of the `eclipse-sumo` package, one vehicle in {SHARE} an AV, driven by `{POLICY}` from",
-            f"an empty road until more than {MOST_AVS} AVs are on it (at least 1 times real time wanted):",
+            f"an empty road until more than {MAX_AVS} AVs are on it. Target: at least real time.",
             "",
             markdown_row(list(found["real"])),
             "|---" * len(found["real"]) + "|",
@@ -258,8 +258,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--avs", type=int, nargs="+", default=list(AVS), metavar="N")
     parser.add_argument("--decisions", type=int, default=40)
-    parser.add_argument("--real", action="store_true", help="A10KW too")
-    parser.add_argument("--profile", action="store_true", help="where the time goes, of each size")
+    parser.add_argument("--real", action="store_true", help="also drive A10KW")
+    parser.add_argument("--profile", action="store_true", help="print cProfile's table for each size")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--out", type=Path, metavar="FILE.md")
     args = parser.parse_args(arguments)

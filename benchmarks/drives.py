@@ -1,4 +1,4 @@
-"""Episodes of one benchmark, each in a process of its own: driven once, kept as rows of a CSV file."""
+"""Episodes of one benchmark, each in its own process: driven once and kept as rows of a CSV file."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ from cosim.batch.episode_runner import EpisodeRunner
 from cosim.files import write_csv
 from cosim.scenario.options import EpisodeOptions
 
-# a NamedTuple: the key of a case, then numbers of its episode (nan: NA)
+# a NamedTuple: the key of a case, then figures of its episode (nan: NA)
 Row = TypeVar("Row", bound=tuple[Any, ...])
 
 
 class Case(NamedTuple):
-    """One episode that is wanted."""
+    """One requested episode."""
 
     key: tuple[Any, ...]  # the first columns of its row
     options: Mapping[str, Any]  # of `EpisodeOptions`
-    constants: Mapping[str, object] = {}  # `package.module.NAME` -> what it is instead
+    constants: Mapping[str, object] = {}  # `package.module.NAME` -> its value instead of the module's
 
 
 def drive(case: Case, columns: Sequence[str]) -> tuple[Any, ...]:
-    """The episode's values of these columns; in a process of its own, whose constants are changed.
+    """The episode's values of these columns. Changes constants of this process.
 
     Raises AttributeError for a constant that its module does not have.
     """
     for place, value in case.constants.items():
-        module, _, name = place.rpartition(".")
-        rules = importlib.import_module(module)
-        getattr(rules, name)
-        setattr(rules, name, value)
+        name, _, constant = place.rpartition(".")
+        module = importlib.import_module(name)
+        getattr(module, constant)
+        setattr(module, constant, value)
     row = EpisodeRunner().run(EpisodeOptions(**case.options), (), None, lambda *_, **__: None)
     return tuple(math.nan if row[column] is None else row[column] for column in columns)
 
@@ -45,7 +45,7 @@ def drive(case: Case, columns: Sequence[str]) -> tuple[Any, ...]:
 def measure(kind: type[Row], cases: Sequence[Case], workers: int, file: Path, again: bool) -> list[Row]:
     """All rows of `file`, in the order of the cases, after the missing cases have been driven.
 
-    The key does not hold options that are equal for all cases: a file is of one set of options.
+    The key does not contain options that are equal for all cases, so these must not change in one file.
 
     Args:
         kind: a NamedTuple of the row.
@@ -56,8 +56,8 @@ def measure(kind: type[Row], cases: Sequence[Case], workers: int, file: Path, ag
     fields = get_type_hints(kind)
     rows = [] if again else read(kind, file)
     size = len(cases[0].key)
-    there = {row[:size] for row in rows}
-    missing = [case for case in cases if case.key not in there]
+    known = {row[:size] for row in rows}
+    missing = [case for case in cases if case.key not in known]
     place = {case.key: number for number, case in enumerate(cases)}
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, spawn, max_tasks_per_child=1) as pool:
@@ -80,6 +80,6 @@ def read(kind: type[Row], file: Path) -> list[Row]:
 
 
 def write(file: Path, columns: Iterable[str], rows: Sequence[tuple[Any, ...]]) -> None:
-    """Keep the rows."""
+    """Write the rows to a CSV file."""
     file.parent.mkdir(parents=True, exist_ok=True)
     write_csv(file, [dict(zip(columns, row, strict=True)) for row in rows])

@@ -58,13 +58,13 @@ ALONE = (
     Raised("failures to yield", {"failure_to_yield": 200.0}, 200.0),
     Raised("stalled cars", {"stalled_car": 1000.0}, 1000.0),
     Raised(
-        "hard braking before the inattentive",
+        "hard braking ahead of an inattentive driver",
         {"hard_braking": 100.0, "inattention": 800.0},
         80_000.0,
         ("inattention", "hard braking"),
     ),
     Raised(
-        "cut-ins before the inattentive",
+        "cut-ins ahead of an inattentive driver",
         {"cut_in": 300.0, "aborted_cut_in": 300.0, "inattention": 800.0},
         240_000.0,
         ("inattention", "cut-ins"),
@@ -169,7 +169,7 @@ def alone(episodes: int) -> list[str]:
     raw: dict[str, float] = {}  # collisions per million km
     added: dict[str, tuple[float, float]] = {}  # near-misses per million km, and their variance
     each: list[tuple[bool, float]] = []  # (whether a collision, weight of a collision)
-    most, more, scatter = 0.0, 0.0, 0.0
+    collisions = near_misses = variance = 0.0
     for name, factors, factor, parts in (Raised("nothing", {}, 1.0), *ALONE):
         kinds = Kinds(**{kind: _raised(getattr(base.kinds, kind), by) for kind, by in factors.items()})
         errors = Errors(name, "", kinds, base.file)
@@ -182,7 +182,7 @@ def alone(episodes: int) -> list[str]:
         found = near / km * MILLION, near / km**2 * MILLION**2
         if not factors:
             without = found
-            lines.append(markdown_row([*cells, "", f"({_signed(*found)} come without)"]))
+            lines.append(markdown_row([*cells, "", f"({_signed(*found)} without errors)"]))
             continue
         raw[name] = pairs / km * MILLION
         added[name] = found[0] - without[0], found[1] + without[1]
@@ -192,12 +192,12 @@ def alone(episodes: int) -> list[str]:
         here = (added[name][0] - sum(added[part][0] for part in parts)) / factor
         spread = (added[name][1] + sum(added[part][1] for part in parts)) / factor**2
         lines.append(markdown_row([*cells, f"{per:.2g} ({bounds})", _signed(here, spread)]))
-        most, more, scatter = most + per, more + here, scatter + spread
+        collisions, near_misses, variance = collisions + per, near_misses + here, variance + spread
         each += [(pairs > 0, MILLION / (km * factor))] * max(pairs, 1)
-    counts, worth = (np.array(values, float) for values in zip(*each, strict=True))
-    pooled = pooled_rate(counts, 1.0 / (len(worth) * worth), worth)
-    together = f"{most:.2g} ({pooled.low:.2g} to {pooled.high:.2g})"
-    return [*lines, markdown_row(["together", "", "", "", "", together, _signed(more, scatter)])]
+    counts, weights = (np.array(values, float) for values in zip(*each, strict=True))
+    pooled = pooled_rate(counts, 1.0 / (len(weights) * weights), weights)
+    together = f"{collisions:.2g} ({pooled.low:.2g} to {pooled.high:.2g})"
+    return [*lines, markdown_row(["together", "", "", "", "", together, _signed(near_misses, variance)])]
 
 
 def _signed(value: float, variance: float) -> str:

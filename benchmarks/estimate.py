@@ -34,7 +34,7 @@ from cosim.workers.tasks import OK
 
 Array = npt.NDArray[np.float64]
 FIRST = 0.4  # target of the first rounds: errors per tilted episode; few, to leave room for rare kinds
-MEET = 0.75  # share of these errors that affect an AV first
+NEAR_AV = 0.75  # share of these errors that affect an AV first
 FOLLOW = 0.3  # target: second errors per episode with a first error
 FOLLOWING = ("inattention", "hard_braking")  # kinds likely to interact with another error within seconds
 ROUNDS = (400, 400, 3000, 2000)  # episodes; the first rounds do not need crashes
@@ -78,12 +78,14 @@ def trials(rows: Sequence[Row]) -> dict[str, Array]:
 
 
 def balanced(rows: Sequence[Row], before: Tilt) -> Tilt:
-    """The tilt with `FIRST` errors per episode, a share `MEET` of them affecting an AV, all kinds equally
-    frequent; and with `FOLLOW` second errors of the kinds `FOLLOWING`."""
+    """The tilt for `FIRST` errors per episode, equally many of each kind, and a share `NEAR_AV` near an AV.
+
+    Second errors are of the kinds `FOLLOWING`, with `FOLLOW` per episode with a first error.
+    """
     factors: dict[str, float] = {}
     found = trials(rows)
     begun = begun_first(found, len(rows))
-    for ending, aim in (("", FIRST * MEET), (OTHER, FIRST * (1.0 - MEET)), (SECOND, FOLLOW)):
+    for ending, aim in (("", FIRST * NEAR_AV), (OTHER, FIRST * (1.0 - NEAR_AV)), (SECOND, FOLLOW)):
         of = begun if ending == SECOND else np.ones(len(rows), bool)  # episodes with possible errors
         names = [n for n in found if ending == ending_of(n)]
         if ending == SECOND:
@@ -166,13 +168,9 @@ def measure(runs: Path, worlds: Sequence[str], episodes: int, workers: int) -> N
 
 def page(runs: Path, out: Path, intervals: int) -> None:
     """Write the page from the toy model (`intervals` estimates per line) and the results of `measure`."""
-    lines = ["# What the intervals of `cosim estimate` are worth", ""]
-    lines += [
-        "Made by `python -m benchmarks.estimate page`; [what is estimated, and how](../guides/estimate.md).",
-        "",
-    ]
-    lines += [*_toy(intervals), *_real(runs), *_field(runs)]
-    write_page(out, lines)
+    lines = ["# Coverage of the intervals of `cosim estimate`", ""]
+    lines += ["Made by `python -m benchmarks.estimate page`. [Method](../guides/estimate.md).", ""]
+    write_page(out, [*lines, *_toy(intervals), *_real(runs), *_field(runs)])
 
 
 def _toy(intervals: int) -> list[str]:
@@ -180,15 +178,15 @@ def _toy(intervals: int) -> list[str]:
     toy = Toy()
     truth = toy.truth()
     lines = [
-        "## A toy of known truth",
+        "## A toy model of known crash rate",
         "",
-        f"Two kinds of errors that crash together, a third that crashes alone and seldom happens "
-        f"(`benchmarks/toy_crashes.py`); truth {1e6 * truth:.1f} crashes per million km. "
-        f"{intervals} estimates a line.",
+        f"Two kinds of errors cause crashes together; a third, rare kind causes crashes alone "
+        f"(`benchmarks/toy_crashes.py`). The true rate is {1e6 * truth:.1f} crashes per million km. "
+        f"Each line has {intervals} estimates.",
         "",
         markdown_row(
-            ("tilt", "episodes each", "crashes each", "effective", "95 % intervals that hold the truth",
-             "truth above, below", "mean over truth", "half width over truth (median)")
+            ("tilt", "episodes each", "crashes each", "effective", "95 % intervals with the true rate",
+             "true rate above, below", "mean / true rate", "half width / true rate (median)")
         ),
         "|---|---|---|---|---|---|---|---|",
     ]  # fmt: skip
@@ -228,10 +226,11 @@ def _real(runs: Path) -> list[str]:
         "",
         f"`idm` AVs, test seeds. Brute force, {len(brute)} episodes: {wording.interval(truth, known)}, "
         f"standard error {of_brute:.0f}. {len(each)} tilted estimates of {EACH} episodes "
-        f"(`{REAL_TILT.text()}`): mean {values.mean():.0f}, scatter {scatter:.0f}, so that brute force errs "
-        f"by {of_brute / scatter:.2f} of a repetition. Difference {values.mean() - truth.value:+.0f} ± "
-        f"{1.96 * error:.0f}: {abs(values.mean() - truth.value) / error:.1f} standard errors. {held} of "
-        f"{len(each)} intervals hold the rate of brute force.",
+        f"(`{REAL_TILT.text()}`): mean {values.mean():.0f}, standard deviation {scatter:.0f}. The standard "
+        f"error of brute force is {of_brute / scatter:.2f} of that. Difference "
+        f"{values.mean() - truth.value:+.0f} ± {1.96 * error:.0f}: "
+        f"{abs(values.mean() - truth.value) / error:.1f} standard errors. {held} of {len(each)} intervals "
+        f"contain the rate of brute force.",
         "",
     ]
 
@@ -245,7 +244,7 @@ def _field(runs: Path) -> list[str]:
         "## `dense` at the level `field`, `idm` AVs",
         "",
         markdown_row(
-            ("world", "episodes", "crashes per million AV-km", "AV-caused", "all, per million vehicle-km",
+            ("scenario", "episodes", "crashes per million AV-km", "AV-caused", "all, per million vehicle-km",
              "crashed episodes, effective", "effective samples", "largest weight of the crashed",
              "episodes for +-50 %", "s each", "hours of two cores for +-50 %")
         ),

@@ -47,7 +47,7 @@ try:
 except traci.exceptions.FatalTraCIError:
     pass
 """
-# SUMO's platoons (sumo/tools/simpla), of vehicles that are no AVs.
+# SUMO's platoons (sumo/tools/simpla), formed by vehicles that are not AVs
 PLATOONS = STEPS.replace("try:", "import simpla\nsimpla.load(sys.argv[2])\ntry:", 1)
 PLATOONED = "mw_passenger"
 SIMPLA = f"""<configuration>
@@ -59,20 +59,20 @@ SIMPLA = f"""<configuration>
 """
 
 
-class Way(NamedTuple):
-    """One condition: a way of sharing SUMO."""
+class Condition(NamedTuple):
+    """One condition: the preset, the AVs, and the other client of SUMO."""
 
-    what: str
+    name: str
     other: str = ""  # code of the other client
     preset: str = "lawful"
     fleet: Fleet = Fleet(penetration=0.2)
 
 
-WAYS = (
-    Way("joined alone"),
-    Way("joined alone, preset unguarded", preset="unguarded"),
-    Way("beside a program that steps along", STEPS),
-    Way("beside SUMO's own simpla, which drives platoons", PLATOONS, fleet=Fleet(ids=r"(?!veh_mw\d).*[0-2]")),
+CONDITIONS = (
+    Condition("no other client"),
+    Condition("no other client, preset unguarded", preset="unguarded"),
+    Condition("beside a client that only steps", STEPS),
+    Condition("beside SUMO's platoons (simpla)", PLATOONS, fleet=Fleet(ids=r"(?!veh_mw\d).*[0-2]")),
 )
 
 
@@ -111,30 +111,36 @@ class Clock(Hook):
         return time.perf_counter(), time.process_time() + ticks / os.sysconf("SC_CLK_TCK")
 
 
-def drive(way: Way, warmup: float, seconds: float, work: Path) -> Drive:
+def drive(condition: Condition, warmup: float, seconds: float, work: Path) -> Drive:
     """One drive of `seconds` counted s with random commands to every AV."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     settings = work / "simpla.cfg.xml"
     settings.write_text(SIMPLA, encoding="utf-8")
-    options = ["--remote-port", str(port), "--num-clients", str(1 + bool(way.other)), "--step-length", "0.1"]
+    options = [
+        "--remote-port",
+        str(port),
+        "--num-clients",
+        str(1 + bool(condition.other)),
+        "--step-length",
+        "0.1",
+    ]
     options += ["--additional-files", ",".join(map(str, ADDITIONAL)), "--lanechange.duration", "2"]
     options += ["--collision.action", "warn", "--collision.mingap-factor", "0", "--time-to-teleport", "-1"]
     binary = str(GAME.parents[1] / "bin" / "sumo")
     commands = [[binary, "-c", str(GAME / "A10KW.sumocfg"), *options, "--collision.check-junctions"]]
-    if way.other:
-        commands.append([sys.executable, "-c", way.other, str(port), str(settings)])
-    nowhere = subprocess.DEVNULL
-    programs = [subprocess.Popen(command, stdout=nowhere, stderr=nowhere) for command in commands]
+    if condition.other:
+        commands.append([sys.executable, "-c", condition.other, str(port), str(settings)])
+    null = subprocess.DEVNULL
+    programs = [subprocess.Popen(command, stdout=null, stderr=null) for command in commands]
     try:
         client = Client("localhost", port, ORDER, LIMIT)
-        theirs_, seed = theirs(client)
-        scenario = replace(theirs_, fleet=way.fleet, preset=way.preset, warmup=warmup, duration=seconds)
-        host, clock = (
-            Host(scenario, "random", 0.0, simulator=joining(client)),
-            Clock([p.pid for p in programs]),
-        )
+        running, seed = theirs(client)
+        changes = {"fleet": condition.fleet, "preset": condition.preset}
+        scenario = replace(running, **changes, warmup=warmup, duration=seconds)
+        host = Host(scenario, "random", 0.0, simulator=joining(client))
+        clock = Clock([p.pid for p in programs])
         try:
             result = host.run(seed, hooks=[clock])
         finally:
@@ -144,7 +150,7 @@ def drive(way: Way, warmup: float, seconds: float, work: Path) -> Drive:
             program.kill()
             program.wait()
     if ended := [reason for reason in result.validity if reason.startswith("ended")]:
-        raise SystemExit(f"error: {way.what}: {ended[0]}")
+        raise SystemExit(f"error: {condition.name}: {ended[0]}")
     vehicles, avs = (statistics.fmean(column) for column in zip(*clock.numbers, strict=True))
     return Drive(seconds / clock.wall, seconds / clock.busy, vehicles, avs)
 
@@ -152,19 +158,19 @@ def drive(way: Way, warmup: float, seconds: float, work: Path) -> Drive:
 def page(found: dict[str, list[Drive]], command: str) -> list[str]:
     """The Markdown page."""
     rows = []
-    for what, drives in found.items():
+    for name, drives in found.items():
         ratio, busy, vehicles, avs = zip(*drives, strict=True)
-        said = f"at least {TARGET:g}: {'met' if statistics.median(ratio) >= TARGET else '**missed**'}"
+        target = f"at least {TARGET:g}: {'met' if statistics.median(ratio) >= TARGET else '**missed**'}"
         mean = [f"{statistics.fmean(column):.0f}" for column in (vehicles, avs)]
-        rows.append([what, *mean, _middle(ratio), _middle(busy), said])
+        rows.append([name, *mean, _median(ratio), _median(busy), target])
     return [
-        "# How fast cosim drives in somebody else's SUMO",
+        "# Speed of `cosim join` in a running SUMO",
         "",
         f"Made by `{command}`: `cosim join` ([traci.md](../guides/traci.md))",
-        f"on A10KW, the motorway interchange that SUMO's package ships, from {WARMUP:g} s on. All AVs are",
-        "commanded at every decision, at random, without a network. SUMO, our agents and the other program",
-        "are a process each and wait for one another: where the machine has nothing else to do both ratios",
-        "are nearly the same. Medians (range).",
+        f"on A10KW, a motorway interchange of SUMO's package, from {WARMUP:g} s on. Every AV gets a random",
+        "command at every decision, without a network. SUMO, the agents and the other client run in one",
+        "process each and wait for one another. On an idle machine both ratios are nearly equal. Values are",
+        "medians (range).",
         "",
         markdown_row(["", "vehicles", "AVs", "times real time", "by processor time", "target"]),
         "|---|---|---|---|---|---|",
@@ -172,7 +178,7 @@ def page(found: dict[str, list[Drive]], command: str) -> list[str]:
     ]
 
 
-def _middle(values: Sequence[float]) -> str:
+def _median(values: Sequence[float]) -> str:
     return f"{statistics.median(values):.1f} ({min(values):.1f} to {max(values):.1f})"
 
 
@@ -181,17 +187,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--rounds", type=int, default=5, metavar="N", help="default 5")
     parser.add_argument("--seconds", type=float, default=20.0, metavar="S", help="counted s of a drive")
-    parser.add_argument("--small", action="store_true", help="one short drive; its figures are worth nothing")
+    parser.add_argument("--small", action="store_true", help="one short drive; the figures are meaningless")
     parser.add_argument("--out", type=Path, metavar="FILE.md", help="default: printed")
     args = parser.parse_args(arguments)
-    ways, warmup = (WAYS[:1], 2.0) if args.small else (WAYS, WARMUP)
+    conditions, warmup = (CONDITIONS[:1], 2.0) if args.small else (CONDITIONS, WARMUP)
     os.environ["SUMO_HOME"] = str(GAME.parents[1])  # simpla finds SUMO's tools there
-    found: dict[str, list[Drive]] = {way.what: [] for way in ways}
+    found: dict[str, list[Drive]] = {condition.name: [] for condition in conditions}
     with tempfile.TemporaryDirectory(prefix="cosim-joining-") as work:
         for number in range(args.rounds):
-            for way in ways:
-                print(f"joining {number + 1}/{args.rounds}: {way.what}", file=sys.stderr, flush=True)
-                found[way.what].append(drive(way, warmup, args.seconds, Path(work)))
+            for condition in conditions:
+                print(f"joining {number + 1}/{args.rounds}: {condition.name}", file=sys.stderr, flush=True)
+                found[condition.name].append(drive(condition, warmup, args.seconds, Path(work)))
     command = f"python -m benchmarks.joining --rounds {args.rounds} --seconds {args.seconds:g}"
     write_page(args.out, page(found, command))
 

@@ -26,7 +26,7 @@ import pyarrow.parquet
 from cosim.types import TIMINGS
 
 MATRIX = "--scenario merge --demand free --policy idm --policy keep-lane --duration 4 --seeds 200000:200008"
-TIMES = {"timings", "attempts", *TIMINGS}
+VARYING = {"timings", "attempts", *TIMINGS}  # columns
 LIMIT = 600.0  # s for a round
 
 
@@ -39,7 +39,7 @@ def command(out: Path, engine: str) -> list[str]:
 def rows(out: Path) -> list[dict[str, Any]]:
     """The rows of a run, without fields that may differ."""
     table = pyarrow.parquet.read_table(out / "episodes.parquet").to_pylist()
-    return [{k: v for k, v in row.items() if k not in TIMES} for row in table]
+    return [{k: v for k, v in row.items() if k not in VARYING} for row in table]
 
 
 def children(pid: int) -> list[int]:
@@ -54,12 +54,12 @@ def children(pid: int) -> list[int]:
 
 
 def disturbed(out: Path, kills: int, dice: random.Random, longest: float, engine: str) -> str:
-    """One round; the kills: "w" of a worker, "P" of the parent."""
-    blows = ""
+    """One round with a kill after at most `longest` s; the kills: "w" of a worker, "P" of the parent."""
+    killed = ""
     began = time.monotonic()
     while True:
         parent = subprocess.Popen(command(out, engine), stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
-        while len(blows) < kills:
+        while len(killed) < kills:
             if dice.random() < 0.75:  # else the parent may be killed before it has workers
                 while parent.poll() is None and not children(parent.pid):
                     time.sleep(0.05)
@@ -71,17 +71,17 @@ def disturbed(out: Path, kills: int, dice: random.Random, longest: float, engine
             workers = children(parent.pid)
             if workers and dice.random() < 0.6:
                 os.kill(dice.choice(workers), signal.SIGKILL)
-                blows += "w"
+                killed += "w"
             else:
                 parent.kill()
-                blows += "P"
+                killed += "P"
                 check_gone(workers)
                 break
-        words = parent.communicate(timeout=LIMIT)[1].decode()
+        stderr = parent.communicate(timeout=LIMIT)[1].decode()
         if parent.returncode == 0:
-            return blows
+            return killed
         if parent.returncode != -signal.SIGKILL or time.monotonic() - began > LIMIT:
-            raise SystemExit(f"cosim evaluate ended with {parent.returncode}: {words}")
+            raise SystemExit(f"cosim evaluate ended with {parent.returncode}: {stderr}")
 
 
 def check_gone(workers: list[int]) -> None:
@@ -118,12 +118,12 @@ def main() -> None:
     wrong = 0
     for k in range(args.rounds):
         out = place / f"round{k}"
-        blows = disturbed(out, args.kills, dice, longest, args.engine)
+        killed = disturbed(out, args.kills, dice, longest, args.engine)
         found = rows(out)
         once = sorted(row["key"] for row in found) == sorted({row["key"] for row in wanted})
         same = found == wanted
         wrong += not (once and same)
-        print(f"round {k + 1}: killed {blows}: each once {once}, identical {same}", flush=True)
+        print(f"round {k + 1}: killed {killed}: each once {once}, identical {same}", flush=True)
     print(f"{args.rounds - wrong} of {args.rounds} rounds identical to the undisturbed run")
     if args.out is None:
         shutil.rmtree(place)

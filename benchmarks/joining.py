@@ -20,7 +20,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import sumo
 
@@ -137,8 +137,8 @@ def drive(condition: Condition, warmup: float, seconds: float, work: Path) -> Dr
     try:
         client = Client("localhost", port, ORDER, LIMIT)
         running, seed = theirs(client)
-        changes = {"fleet": condition.fleet, "preset": condition.preset}
-        scenario = replace(running, **changes, warmup=warmup, duration=seconds)
+        times: dict[str, Any] = {"warmup": warmup, "duration": seconds}
+        scenario = replace(running, fleet=condition.fleet, preset=condition.preset, **times)
         host = Host(scenario, "random", 0.0, simulator=joining(client))
         clock = Clock([p.pid for p in programs])
         try:

@@ -40,15 +40,15 @@ from tests.worlds.build import NAMES, build
 
 VALIDATION, PAGE = 100_000, 200_000  # first seeds
 PAGE_FILE = Path("docs/results/law.md")
-IN_THE_TABLES_ALONE = ("interventions", "blocked", "persons", "figures agree")  # columns
+DETAILS = ("interventions", "blocked", "persons", "figures agree")  # columns that the page leaves out
 IDM = "idm"
 ARMS = ("car-alone", "random")  # without networks, since the lawful car is under test
 FREE = ("random",)  # arms without targets for distance, trips and braking
 SHARES = (0.2, 1.0)  # of AVs
 NOTES = {  # arm -> explanation on the page
-    IDM: "`idm`: SUMO's driver in every AV, beside which targets are set.",
-    "car-alone": "`car-alone` asks the car for more speed at every decision.",
-    "random": "`random` asks the car for a random action at every decision.",
+    IDM: "In `idm` SUMO's driver drives every AV; targets are relative to it.",
+    "car-alone": "The agent of `car-alone` asks the car for more speed at every decision.",
+    "random": "The agent of `random` asks the car for a random action at every decision.",
 }
 FIGURES = (  # of the rows, beside the checker's counts
     *("red_light_violations", "stop_sign_violations", "right_of_way_violations", "speeding_share"),
@@ -74,7 +74,7 @@ class Checked(EpisodeRunner):
     def run(  # type: ignore[override]
         self, case: Case, warnings: tuple[str, ...], keep: str | None, progress: tasks.Progress
     ) -> Row:
-        """The row: `law`, the checker's counts; `figures`, the document's. Outputs stay in `keep`, if any."""
+        """The row: `law` has the checker's counts, `figures` the document's. `keep`: folder for outputs."""
         host = self.open(case, warnings)
         with tempfile.TemporaryDirectory(prefix="cosim-law-") as scratch:
             folder = Path(scratch) if keep is None else Path(keep) / case.key
@@ -160,8 +160,8 @@ class Cell:
         return "0" if not count else f"{count}: {statistics.rate(count, len(self.rows)).text(2)}"
 
 
-# Column -> text of a cell, and whether its target is met, given idm's cell (None: no target).
 def _columns(cell: Cell, idm: Cell, free: bool) -> dict[str, tuple[str, bool | None]]:
+    """Column -> text of a cell, and whether its target is met, given idm's cell (None: no target)."""
     episodes = len(cell.rows)
     worst = max(row["law"]["worst_speeding_mps"] for row in cell.rows)
     over = int(cell.total("speeding_steps"))
@@ -169,7 +169,7 @@ def _columns(cell: Cell, idm: Cell, free: bool) -> dict[str, tuple[str, bool | N
     trips, wanted = cell.total("av_trips_completed"), idm.total("av_trips_completed")
     distance, other = cell.total("distance_mean_m") / episodes, idm.total("distance_mean_m") / episodes
     hard, allowed = cell.total("hard_brakings_av"), idm.total("hard_brakings_av")
-    asked = None if free else True
+    targeted = None if free else True
     return {
         "red": (cell.rate("red_light_violations"), not cell.total("red_light_violations")),
         "stop": (cell.rate("stop_sign_violations"), not cell.total("stop_sign_violations")),
@@ -180,11 +180,11 @@ def _columns(cell: Cell, idm: Cell, free: bool) -> dict[str, tuple[str, bool | N
         "steps too fast (worst)": (f"{over} ({worst:+.1f} m/s)", not over),
         "AV collisions (caused)": (f"{int(cell.total('av_involved_collisions'))} ({caused})", not caused),
         "stuck": (cell.rate("avs_stuck"), not cell.total("avs_stuck")),
-        "AV trips": (f"{trips:.0f} of {wanted:.0f}", asked and trips >= 0.95 * wanted),
-        "distance of all": (f"{distance:.0f} of {other:.0f} m", asked and distance >= 0.95 * other),
+        "AV trips": (f"{trips:.0f} of {wanted:.0f}", targeted and trips >= 0.95 * wanted),
+        "distance of all": (f"{distance:.0f} of {other:.0f} m", targeted and distance >= 0.95 * other),
         "hard brakings (figure)": (
             f"{hard:.0f} to {allowed:.0f} ({_plain(cell.figure('hard_brakings_av'))})",
-            asked and hard <= max(2.0 * allowed, 0.5 * episodes),
+            targeted and hard <= max(2.0 * allowed, 0.5 * episodes),
         ),
         "interventions": (_plain(cell.figure("interventions")), None),
         "blocked": (_plain(cell.figure("junctions_blocked")), None),
@@ -200,8 +200,10 @@ COUNTED_TWICE = (
 
 
 def differences(row: Row) -> dict[str, tuple[float, float]]:
-    """Figure -> (the checker's count, the row's) for differing figures; differences due to collisions that
-    SUMO does not report are ignored."""
+    """Figure -> (the checker's count, the row's) for differing figures.
+
+    Differences due to collisions that SUMO does not report are ignored.
+    """
     law, figures = row["law"], row["figures"]
     by_collision = ("right_of_way_violations", "av_involved_collisions", "av_trips_completed")
     law = law | {"worst_speeding_mps": law["worst_speeding_in_frames_mps"]}
@@ -253,15 +255,15 @@ def shown(rows: Sequence[Row]) -> list[str]:
             f"{where}: {v['time']:g} s {v['kind']} {v['vehicle']} {v['link']} {v['what']}"
             for v in row["law"]["violations"]
         ]
-        for name, (counted, said) in differences(row).items():
-            lines.append(f"{where}: {name}: the checker counts {counted:g}, the figure says {said:g}")
+        for name, (counted, figure) in differences(row).items():
+            lines.append(f"{where}: {name}: the checker counts {counted:g}, the figure is {figure:g}")
     return lines
 
 
 def beside_idm(rows: Sequence[Row]) -> list[str]:
     """Markdown: episodes with an AV in a collision, paired with `idm`'s, per network and for all."""
     head = ["world", "AVs", "arm", "pairs", "an AV in a collision", "of `idm`", "difference, pp", "p"]
-    head += ["an AV caused one", "of `idm`", "distance of all, more m"]
+    head += ["caused by an AV", "of `idm`", "distance of all, difference in m"]
     lines = [markdown_row(head), markdown_row(["---"] * len(head))]
     at = {(row["world"], row["penetration"], row["arm"], row["seed"]): row["figures"] for row in rows}
     worlds = list(dict.fromkeys(row["world"] for row in rows))
@@ -304,11 +306,11 @@ def page(rows: Sequence[Row], preset: str, seeds: range, command: str) -> list[s
         for (world, share, arm), cell in of_each.items()
         if arm != IDM and (found := _missed(cell, of_each[world, share, IDM], arm))
     ]
-    asked = sum(arm != IDM for _, _, arm in of_each)
+    judged = sum(arm != IDM for _, _, arm in of_each)
     return [
         "# Does the lawful car keep the law?",
         "",
-        f"**{'No' if missed else 'Yes'}.** {asked - len(missed)} of {asked} cases meet every target.",
+        f"**{'No' if missed else 'Yes'}.** {judged - len(missed)} of {judged} cases meet every target.",
         "A case is a network, a share of AVs and an agent.",
         "",
         *_summary(_cells(rows)),
@@ -320,11 +322,11 @@ def page(rows: Sequence[Row], preset: str, seeds: range, command: str) -> list[s
         f"{seeds.start:,}.",
         *(NOTES[arm] for arm in dict.fromkeys(row["arm"] for row in rows) if arm in NOTES),
         "",
-        "tests/law/checker.py counts from SUMO's outputs and shares no code with what drives. Counts are",
-        "events of AVs, with events an episode and the exact Poisson 95 % interval. Targets: no red light,",
-        "no stop sign, no step above the limit by more than 1 m/s, no collision that an AV caused, no AV",
-        "stuck; at most as many failures to yield as `idm`. Other agents than `random` also need 95 % of",
-        "`idm`'s trips and distance, and at most twice its hard brakings.",
+        "tests/law/checker.py counts violations in SUMO's outputs and shares no code with the simulation.",
+        "Counts are events of AVs, with events per episode and the exact Poisson 95 % interval. Targets: no",
+        "red light, no stop sign, no step above the limit by more than 1 m/s, no collision caused by an AV,",
+        "no AV stuck, and at most as many failures to yield as `idm`. Agents other than `random` also need",
+        "95 % of `idm`'s trips and distance, and at most twice its hard brakings.",
         "",
         "```",
         command,
@@ -351,7 +353,7 @@ def _summary(cells: Mapping[tuple[float, str], Cell]) -> list[str]:
     lines: list[str] = []
     for (share, arm), cell in cells.items():
         columns = _columns(cell, cells[share, IDM], arm in FREE)
-        shown = {name: text for name, (text, _) in columns.items() if name not in IN_THE_TABLES_ALONE}
+        shown = {name: text for name, (text, _) in columns.items() if name not in DETAILS}
         if not lines:
             lines = [markdown_row(["AVs", "agent", *shown]), "|---" * (len(shown) + 2) + "|"]
         lines.append(markdown_row([f"{share:.0%}", arm, *shown.values()]))
@@ -373,12 +375,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("--worlds", nargs="+", choices=NAMES, default=list(NAMES), metavar="NAME", help=", ".join(NAMES))
     add("--arms", nargs="+", default=list(ARMS), metavar="POLICY", help=f"beside idm; {' '.join(ARMS)}")
     add("--penetration", nargs="+", type=float, default=list(SHARES), metavar="X", help="share of AVs")
-    add("--seeds", type=int, default=3, metavar="N", help="how many")
-    add("--first", type=int, metavar="SEED", help=f"default {VALIDATION}; of the page {PAGE}")
+    add("--seeds", type=int, default=3, metavar="N", help="number of seeds")
+    add("--first", type=int, metavar="SEED", help=f"first seed: default {VALIDATION}, with --page {PAGE}")
     add("--preset", choices=Preset.ALL, default=Preset.LAWFUL)
-    add("--errors", metavar="LEVEL", help="of human drivers; none")
+    add("--errors", metavar="LEVEL", help="human errors (default: none)")
     add("--workers", type=int, default=2, metavar="N")
-    add("--runs", type=Path, metavar="DIR", help="keep the rows there, and go on from them")
+    add("--runs", type=Path, metavar="DIR", help="keep the rows there, and continue from them")
     add("--keep", type=Path, metavar="DIR", help="keep SUMO's outputs there")
     add("--show", action="store_true", help="list every violation")
     add("--page", action="store_true", help="write the page")
@@ -394,12 +396,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if args.show:
         print("\n".join(shown(rows)))
     if args.page:
-        said = f"python -m benchmarks.law --page --seeds {args.seeds}"
-        said += "" if args.preset == Preset.LAWFUL else f" --preset {args.preset}"
-        said += f" --errors {args.errors}" if args.errors else ""
-        said += "" if args.arms == [*ARMS] else f" --arms {' '.join(args.arms)}"
+        command = f"python -m benchmarks.law --page --seeds {args.seeds}"
+        command += "" if args.preset == Preset.LAWFUL else f" --preset {args.preset}"
+        command += f" --errors {args.errors}" if args.errors else ""
+        command += "" if args.arms == [*ARMS] else f" --arms {' '.join(args.arms)}"
         out = args.out or PAGE_FILE
-        write_page(out, page(rows, args.preset, seeds, said))
+        write_page(out, page(rows, args.preset, seeds, command))
         print(out)
     else:
         print("\n".join([*tables(rows), *(beside_idm(rows) if args.errors else [])]))

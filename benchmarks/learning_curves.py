@@ -97,11 +97,11 @@ def together(courses: Sequence[Course]) -> tuple[Floats, Floats, Floats, Floats]
 
 def page(runs: Sequence[Training], command: str, drawn: str = "") -> list[str]:
     """The Markdown page."""
-    lines = ["# How learning went", "", f"Made by `{command}`.", ""]
+    lines = ["# Learning curves", "", f"Made by `{command}`.", ""]
     lines += [
-        f"Training drives: means over {WINDOW} iterations; they explore.",
-        "Validation: greedy, on validation seeds. Thin: a training seed each; thick: their mean. In the",
-        "table the mean over seeds, in brackets the lowest and the highest.",
+        f"Training drives explore; their values are means over {WINDOW} iterations. Validation is greedy, on",
+        "validation seeds. Thin lines are single training seeds, thick lines are their mean. The table has",
+        "the mean over training seeds, and in brackets the lowest and the highest value.",
         "",
         *([f"![crashes, missions, distance over training]({drawn})", ""] if drawn else []),
         markdown_row(["agent", "seeds", "iterations", "drives", "figure", "first", "last"]),

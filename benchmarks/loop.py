@@ -67,7 +67,7 @@ class Bare:
 
 
 class Ours:
-    """The loop without agent: advance, read, draw, keep the history."""
+    """The loop without agent: advance SUMO, read the state, draw maps, keep the history."""
 
     def __init__(self, scenario: Scenario, observation: ObservationConfig) -> None:
         from cosim.observation.observer import Observer

@@ -163,7 +163,7 @@ def yielding(place: Place) -> list[list[str]]:
 
 
 def throughput(place: Place) -> list[list[str]]:
-    """What AVs do to the arrivals of foreign networks."""
+    """Arrivals with and without AVs in networks of other authors."""
     few = ["--nets", "corridor", "--seeds", "300000:300001", "--duration", "30"] if place.small else []
     return [["benchmarks.throughput", *few, "--out", str(place.out)]]
 
@@ -222,7 +222,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--only", nargs="+", choices=[page.name for page in PAGES], metavar="NAME")
-    parser.add_argument("--again", action="store_true", help="also finished pages")
+    parser.add_argument("--again", action="store_true", help="measure finished pages again")
     parser.add_argument("--small", action="store_true", help="minimal sizes, to test")
     parser.add_argument("--out", type=Path, default=RESULTS, metavar="DIR", help="pages and pictures")
     parser.add_argument("--runs", type=Path, default=Path("runs/measured"), metavar="DIR")
@@ -238,9 +238,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
             words = " ".join(["python", *error.cmd[1:]])
             raise SystemExit(f"error: {page.name}: `{words}` ended with {error.returncode}") from None
         except KeyboardInterrupt:
-            print("interrupted: the same command goes on", file=sys.stderr)
+            print("interrupted: the same command continues", file=sys.stderr)
             raise SystemExit(130) from None
-        took = f"{time.perf_counter() - began:.0f} s" if fresh else "finished before (--again measures anew)"
+        took = (
+            f"{time.perf_counter() - began:.0f} s" if fresh else "finished before (--again measures it again)"
+        )
         print(f"measured {number}/{len(pages)}: {page.name}: {took}", file=sys.stderr, flush=True)
         print(place.out / page.files[0])
 

@@ -24,13 +24,13 @@ Card = Mapping[str, Any]
 RESULTS = Path("docs/results")
 LINK = "../results"  # from the page
 HEAD = (
-    "# The networks that ship",
+    "# The shipped networks",
     "",
     "Made by `python -m benchmarks.model_cards`.",
     "",
-    "Each network has a card beside its weights, `policy/weights/NAME.json`: data, whole configuration,",
-    "commands, validation figures and SHA-256. The licence is MIT, as of the code. All seeds of training",
-    "are below 100,000.",
+    "Each network has a card beside its weights, `policy/weights/NAME.json`. It holds data, complete",
+    "configuration, commands, validation figures and SHA-256. The licence is MIT, like the code's. All",
+    "training seeds are below 100,000.",
 )
 AGENTS = (
     "network",
@@ -45,13 +45,13 @@ AGENTS = (
 )
 PREDICTORS = ("network", "predicts", "data", "training", "in validation", "results", "limits")
 LIMITS = {
-    "law": "Knows no signal, no limit of a junction's lane, no pedestrian and no bicycle. In `unguarded` it "
-    "drives through red lights.",
-    "maps only": "Sees nothing but maps.",
-    "one seed": "One training from one seed, in preset `unguarded`, among drivers who made no errors. How "
-    "much another seed differs is not measured.",
-    "scenarios": "Learned from the shipped scenarios alone, with drivers who follow IDM and LC2013 or MOBIL "
-    "and make no errors. Its error on recorded traffic or on other roads is unknown.",
+    "law": "Has no input for signals, speed limits inside junctions, pedestrians or bicycles. In preset "
+    "`unguarded` it drives through red lights.",
+    "maps only": "Has no other inputs than maps.",
+    "one seed": "Was trained once, from one seed, in preset `unguarded`, with human drivers without errors. "
+    "The difference to another seed is not measured.",
+    "scenarios": "Was trained on the shipped scenarios only, with drivers that follow IDM and LC2013 or "
+    "MOBIL, without errors. Its error on recorded traffic or on other roads is unknown.",
 }
 # Results page -> form of a network's name in its table.
 MEASURED = {
@@ -176,21 +176,13 @@ def encoder(name: str, card: Card) -> tuple[str, ...]:
     frames, r2 = card["data"]["frames"]["training"], card["measured"]["R2 on tuning seeds"]
     shown = {"gap": "gap ahead, own lane", "speed": "speed ahead, own lane"}
     error = "R² ahead in its lane: " + ", ".join(f"{what} {r2[key]:.2f}" for what, key in shown.items())
-    what = "what stands on a velocity map, as 128 numbers"
-    return (
-        f"`{name}`",
-        what,
-        f"{frames:,} maps",
-        "`cosim train encoder`",
-        error,
-        "none",
-        "scenarios",
-    )
+    what = "the vehicles on a velocity map, as 128 numbers"
+    return f"`{name}`", what, f"{frames:,} maps", "`cosim train encoder`", error, "none", "scenarios"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write the page."""
-    parser = argparse.ArgumentParser(description="Write the page of the networks that ship.")
+    parser = argparse.ArgumentParser(description="Write the page of the shipped networks.")
     parser.add_argument("--out", type=Path, default=Path("docs/reference/models.md"), metavar="FILE")
     args = parser.parse_args(arguments)
     try:

@@ -89,11 +89,12 @@ def _loop(one: dict[str, Any], command: str) -> list[str]:
         "## The loop",
         "",
         f"`{command}`: one decision without the agent (4 SUMO steps of 0.1 s, two frames of",
-        "VelocityMap and kinematics for every AV, full history) against bare libsumo on the same episode,",
-        "and HighwayEnv with as many vehicles, as many agents and a grid of comparable size. Tuning seeds,",
-        f"`{one['scenario']}`, `{one['demand']}`, {one['vehicles']:.0f} vehicles and {one['avs']:.0f} AVs at",
-        "the median decision, AVs driven by SUMO. The processes take turns every five decisions, so that",
-        "whatever else the machine does meets all alike; medians over decisions, then over rounds (range).",
+        "VelocityMap and kinematics for every AV, full history) compared with bare libsumo on the same",
+        "episode, and with HighwayEnv with equally many vehicles and agents and a grid of similar size.",
+        f"Scenario `{one['scenario']}`, demand `{one['demand']}`, validation seeds, AVs driven by SUMO. The",
+        f"median decision has {one['vehicles']:.0f} vehicles and {one['avs']:.0f} AVs. The processes",
+        "alternate every five decisions, so that other load affects all equally. Values are medians over",
+        "decisions, then over rounds (range).",
         "",
         *_rows(
             times("compact"),
@@ -111,7 +112,7 @@ def _loop(one: dict[str, Any], command: str) -> list[str]:
             (
                 "of which bare `libsumo.load`, same options, same process",
                 f"{one['bare_load_ms']:.2f} ms",
-                "not ours",
+                "",
             ),
             (f"memory over {one['resets']} resets", f"{one['memory_growth_mib']:+.1f} MiB", "flat"),
         ),
@@ -146,7 +147,7 @@ def _prediction(one: dict[str, Any], command: str) -> list[str]:
     return [
         "## Prediction",
         "",
-        f"`{command}`: {one['vehicles']} vehicles of recorded episodes (tuning seeds) at a time.",
+        f"`{command}`: {one['vehicles']} vehicles of recorded episodes (validation seeds) at a time.",
         "",
         *_rows(
             ("kernel bank", f"{one['bank_ms']:.2f} ms", _target(one["bank_ms"], one["target_ms"], " ms")),

@@ -135,9 +135,9 @@ def map_branch(config: MapBranchConfig, horizon: int, rounds: int, backend: str)
     steps = horizon // config.block
     out: dict[str, float | str] = {}
 
-    def note(way: str, result: float | str) -> None:
-        out[way] = result
-        say(f"  map branch, {way}: {_ratio(result)}")
+    def note(name: str, result: float | str) -> None:
+        out[name] = result
+        say(f"  map branch, {name}: {_ratio(result)}")
 
     def chain(step: Callable[..., Any]) -> None:
         window = past
@@ -176,10 +176,10 @@ def page(result: Mapping[str, Mapping[str, Any]], command: str) -> list[str]:
     lines = [
         "# What a prediction costs",
         "",
-        f"Made by `{command}`; tuning seeds, {AGENTS} AVs, four seconds ahead, medians. Real time is the",
-        f"decision period, {1e3 * DECISION:.0f} ms: 10 x real time means that a tenth of it is used.",
+        f"Made by `{command}`; validation seeds, {AGENTS} AVs, four seconds ahead, medians. Real time is the",
+        f"decision period, {1e3 * DECISION:.0f} ms. At 10 x real time a prediction takes a tenth of it.",
         "",
-        "## The HPN that ships, by its parts, ms",
+        "## The shipped HPN by parts, ms",
         "",
     ]
     parts_of = list(next(iter(result.values()))["parts"])
@@ -195,8 +195,8 @@ def page(result: Mapping[str, Mapping[str, Any]], command: str) -> list[str]:
         "## P's own network (`hpn-plain`: figure 3, algorithm 1), the whole chain",
         "",
     ]
-    ways = list(next(iter(result.values()))["map branch"])
-    lines += [markdown_row(["size", *ways]), "|---" * (len(ways) + 1) + "|"]
+    backends = list(next(iter(result.values()))["map branch"])
+    lines += [markdown_row(["size", *backends]), "|---" * (len(backends) + 1) + "|"]
     lines += [
         markdown_row([name, *map(_ratio, found["map branch"].values())]) for name, found in result.items()
     ]
@@ -256,8 +256,8 @@ def main() -> None:
             spent = parts(road, kept, size, chain)
             say(f"  whole prediction: {_ratio(spent['whole prediction'])}")
             vehicles = round(float(np.mean([len(join(h).vehicles) for h in kept])), 1)
-            ways = map_branch(branch, chain.horizon, args.rounds, args.backend)
-            result[label] = {"parts": spent, "map branch": ways, "vehicles": vehicles}
+            backends = map_branch(branch, chain.horizon, args.rounds, args.backend)
+            result[label] = {"parts": spent, "map branch": backends, "vehicles": vehicles}
     if args.json:
         print(json.dumps(result))
         return

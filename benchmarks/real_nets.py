@@ -4,8 +4,8 @@
                                    [--runs FILE.csv] [--held] [--out docs/results/real_nets.md]
 
 Drives A10KW, a motorway interchange, and every other configuration that loads, with SUMO's driver in every
-AV. Measures time, memory, collisions and offences. Episodes in `--runs` are not driven again (default: those
-of the page). `--held` drives nothing. Needs `pip install cosim-sumo[tools]`.
+AV. Measures time, memory, collisions and offences. Episodes in `--runs` (default: the page's) are not driven
+again. `--held` drives nothing. Needs `pip install cosim-sumo[tools]`.
 """
 
 from __future__ import annotations
@@ -193,10 +193,10 @@ def page(rows: Sequence[Driven], lacking: Sequence[str], command: str) -> list[s
     networks = {name: [row for row in rows if row.network == name] for name in names}
     populated = {name: of for name, of in networks.items() if any(row.avs for row in of)}
     return [
-        "# Do networks of other authors drive as they stand?",
+        "# Do networks of other authors run unmodified?",
         "",
         f"**{'No' if lacking else 'Yes'}.** {len(networks)} networks of the `eclipse-sumo` package",
-        f"are driven, to their end or for {LONGEST:,.0f} s. {len(lacking)} runs are missing.",
+        f"are driven to their end, or for {LONGEST:,.0f} s. {len(lacking)} runs are missing.",
         f"{len(populated)} networks have AVs.",
         "",
         markdown_row(COLUMNS),
@@ -207,8 +207,8 @@ def page(rows: Sequence[Driven], lacking: Sequence[str], command: str) -> list[s
         "",
         f"{PENETRATION:.0%} of the vehicles are AVs, driven by SUMO (`{POLICY}`) without any value network.",
         f"Seeds from {FIRST_SEED:,}. Offences are red lights, stop signs and failures to",
-        "yield of AVs. An AV is stuck that stands without a reason. Memory is that of the simulation's",
-        f"process at the end; times are of a shared machine. Rows: [data/{KEPT.name}](data/{KEPT.name}).",
+        "yield of AVs. An AV is stuck if it stands without a reason. Memory is that of the simulation's",
+        f"process at the end. Times are from a shared machine. Rows: [data/{KEPT.name}](data/{KEPT.name}).",
         "",
         "```",
         command,
@@ -222,11 +222,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--duration", type=float, metavar="S", help="default: to each scenario's end")
     parser.add_argument("--seeds", type=int, default=SEEDS, metavar="N", help=f"of A10KW ({SEEDS})")
-    parser.add_argument("--nets", nargs="+", metavar="NAME", help="only these: A10KW, grid6 ...")
+    parser.add_argument("--nets", nargs="+", metavar="NAME", help="networks (A10KW, grid6 ...); default: all")
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes (1)")
     parser.add_argument("--runs", type=Path, default=KEPT, metavar="FILE.csv")
     parser.add_argument(
-        "--held", action="store_true", help="write the page of what was driven, drive nothing"
+        "--held", action="store_true", help="drive nothing, write the page from the driven episodes"
     )
     parser.add_argument("--out", type=Path, default=PAGE, metavar="FILE.md")
     args = parser.parse_args(arguments)

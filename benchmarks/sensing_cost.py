@@ -80,8 +80,8 @@ def page(drives: Sequence[Drive], names: Sequence[str]) -> list[str]:
         "",
         "Made by `python -m benchmarks.sensing_cost --out docs/results/sensing_cost.md`.",
         "",
-        "Microseconds of processor time an AV and frame, on one thread: sensors, messages, tracks and the",
-        f"percept of every AV. The least of {ROUNDS} rounds over the same frames.",
+        "Microseconds of processor time per AV and frame, on one thread: sensors, messages, tracks and the",
+        f"percept of every AV. Values are the minimum of {ROUNDS} rounds over the same frames.",
         "",
         markdown_row(["where", "AVs", "vehicles", *names]),
         markdown_row(["---"] * (3 + len(names))),
@@ -102,7 +102,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--levels", nargs="+", default=[IDEAL, *levels()])
     parser.add_argument("--frames", type=int, default=100)
-    parser.add_argument("--small", action="store_true", help="few frames, the merge alone")
+    parser.add_argument("--small", action="store_true", help="few frames, only the merge")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args(arguments)
     merge = load("merge", demand=["contested"], penetration=0.4, preset=Preset.UNGUARDED)

@@ -110,14 +110,14 @@ def _measure(pages: list[Page], pid: int, log: Path, wrong: list[str], minutes: 
 def _page(page: Page, url: str, policy: str, wrong: list[str]) -> Page:
     """A browser page that drives and shows episode after episode."""
     page.on("pageerror", lambda error: wrong.append(f"page: {error}"))
-    page.on("console", lambda said: wrong.append(f"console: {said.text}") if said.type == "error" else None)
+    page.on("console", lambda line: wrong.append(f"console: {line.text}") if line.type == "error" else None)
     page.goto(url)
     page.wait_for_selector("#scenario option[value=contested]", state="attached")
     page.select_option("#scenario [name=policy]", policy)
     page.click("#go", timeout=120_000)
     while not page.evaluate("() => Boolean(window.replay && replay.t > 0.5)"):
-        if said := page.inner_text("#wrong") or page.inner_text("#said"):
-            raise SystemExit(f"the page says: {said}")
+        if text := page.inner_text("#wrong") or page.inner_text("#said"):
+            raise SystemExit(f"the page shows: {text}")
         page.wait_for_timeout(200)
     page.check("#on")
     page.evaluate(COUNT)

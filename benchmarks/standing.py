@@ -1,4 +1,4 @@
-"""Vehicles that stand for long without a reason on any network, and the resulting delays.
+"""Number of vehicles on a network that stand for long without a reason, and the resulting delays.
 
     python -m benchmarks.standing CONFIG [--av-type NAME | --penetration P] [--policies NAME ...]
                                   [--seeds A:B] [--duration S] [--warmup S]

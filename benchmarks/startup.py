@@ -26,8 +26,9 @@ TARGET = {"idm": 5.0, POLICY: 2.0}
 
 PAGE = """# How long a short command takes to start
 
-Made by `python -m benchmarks.startup --rounds {rounds}`: whole processes, in turn, kernels compiled;
-medians of {rounds} rounds (range). Ratios are formed within a round. Compare ratios, not seconds.
+Made by `python -m benchmarks.startup --rounds {rounds}`. Whole processes alternate, with compiled
+kernels. Values are medians of {rounds} rounds (range). Ratios are formed within a round. Compare
+ratios, not seconds.
 
 |  | measured | target |
 |---|---|---|

@@ -25,7 +25,7 @@ def marked(text: str, name: str) -> tuple[str, str, str] | None:
     before, begun, rest = text.partition(begin)
     between, ended, after = rest.partition(end)
     if begun and not ended:
-        raise SystemExit(f"{begin} stands without {end}")
+        raise SystemExit(f"{begin} has no {end} after it")
     return (before, between, after) if begun else None
 
 
@@ -53,7 +53,7 @@ def write_page(path: Path | None, lines: Sequence[str]) -> None:
     if path.is_file() and (parts := marked(path.read_text(encoding="utf-8"), READ)):
         first = next((k for k, line in enumerate(lines) if line.startswith("## ")), len(lines))
         lines = [*lines[:first], begin + parts[1] + end, "", *lines[first:]]
-        print(f"{path}: does what stands between {begin} and {end} still hold?", file=sys.stderr)
+        print(f"{path}: check whether the text between {begin} and {end} still holds", file=sys.stderr)
     with whole(path) as draft:
         draft.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
 

@@ -1,11 +1,11 @@
-"""Do AVs choke networks that others made? Arrivals beside the same traffic without AVs.
+"""Arrivals with AVs in networks of other authors, compared with the same demand without AVs.
 
     python -m benchmarks.throughput [--seeds A:B] [--nets NAME ...] [--config FILE.sumocfg ...]
                                     [--duration S] [--workers N] [--again] [--out docs/results]
 
 Drives A10KW, a motorway interchange, on every seed and the other games of the eclipse-sumo package on the
-first; `--config` drives a network of your own instead. Rows are kept in docs/results/data/throughput.csv; the
-page is made of them. Needs `pip install cosim-sumo[tools]`.
+first; `--config` drives your own network instead. Rows are kept in docs/results/data/throughput.csv; the page
+is made from them. Needs `pip install cosim-sumo[tools]`.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Drive(NamedTuple):
 
 
 def cases(configs: Sequence[Path], seeds: range, every: bool, duration: float) -> Iterator[Case]:
-    """Every episode that is wanted; `every`: all networks on every seed, else A10KW alone."""
+    """Every requested episode; `every`: all networks on every seed, else only A10KW."""
     for config in configs:
         for seed in seeds if every or config.stem == "A10KW" else seeds[:1]:
             for driver, options in DRIVERS.items():
@@ -61,7 +61,7 @@ def cases(configs: Sequence[Path], seeds: range, every: bool, duration: float) -
 
 def page(rows: Sequence[Drive], duration: float) -> list[str]:
     """The page; `duration`: s of each drive."""
-    columns = ["network", "seeds", "driver", "arrivals", "change", "delay of everybody, s", "AVs stuck"]
+    columns = ["network", "seeds", "driver", "arrivals", "change", "total delay, s", "AVs stuck"]
     columns += ["collisions with an AV", "caused by AVs"]
     lines = [markdown_row(columns), "|---" * len(columns) + "|"]
     networks: list[str] = []
@@ -81,7 +81,7 @@ def page(rows: Sequence[Drive], duration: float) -> list[str]:
 
 
 def _cells(before: Sequence[float], drives: Sequence[Drive]) -> list[str]:
-    """One driver's on one network; `before`: arrivals without AVs, seed by seed."""
+    """The cells of one driver on one network; `before`: arrivals without AVs, seed by seed."""
     arrived = [one.arrivals for one in drives]
     counts = (
         sum(getattr(one, name) for one in drives)
@@ -104,19 +104,19 @@ def _change(before: Sequence[float], after: Sequence[float]) -> str:
     return f"{100.0 * found.value:+.1f} %{bounds}"
 
 
-WORDS = """# Do AVs choke networks of other authors?
+WORDS = """# Do AVs reduce the throughput of other authors' networks?
 
-Arrivals beside the same demand without AVs, with 95 % intervals over paired seeds. Fewer than five
-seeds resolve nothing and have no interval. 20 % of the vehicles are AVs. The lawful car's agent
-always asks for more speed, at phi 45.
+Arrivals compared with the same demand without AVs, with 95 % intervals over paired seeds. There is
+no interval for fewer than five seeds. 20 % of the vehicles are AVs. The lawful car's agent always
+asks for more speed, at phi 45.
 
 {table}
 
 ## Conditions
 
-Each network is driven as it stands, for {longest:.0f} s at most, without driver errors. Sensing is
-`ideal`. Its human drivers are its own. Seeds are from 300,000. An AV is stuck that stands for a
-minute without a reason ([figures](../reference/figures.md)). Rows:
+The networks and their human drivers are unmodified, without driver errors. Each is driven for
+{longest:.0f} s at most. Sensing is `ideal`. Seeds are from 300,000. An AV is stuck if it stands for
+a minute without a reason ([figures](../reference/figures.md)). Rows:
 [{data}]({data}).
 
 ```
@@ -128,7 +128,7 @@ Your own network: `--config FILE.sumocfg --out FOLDER`.
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Drive what is missing, keep, write."""
+    """Drive the missing episodes, then write rows and page."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -136,10 +136,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--nets", nargs="+", default=NETS, metavar="NAME")
     parser.add_argument("--config", nargs="+", type=Path, metavar="FILE")
     parser.add_argument(
-        "--duration", type=float, default=LONGEST, metavar="S", help="for a folder of its own"
+        "--duration", type=float, default=LONGEST, metavar="S", help="of each drive; needs its own --out"
     )
     parser.add_argument("--workers", type=int, default=2, metavar="N")
-    parser.add_argument("--again", action="store_true", help="also what is measured")
+    parser.add_argument("--again", action="store_true", help="drive the kept episodes again")
     parser.add_argument("--out", type=Path, default=RESULTS, metavar="FOLDER")
     args = parser.parse_args(arguments)
     configs = args.config or [a10kw().with_name(f"{name}.sumocfg") for name in args.nets]

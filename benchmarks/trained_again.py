@@ -2,11 +2,11 @@
 
     python -m benchmarks.trained_again [NETWORK ...] [--iterations 10]
 
-Commands are from the model cards (docs/reference/models.md), logs from docs/results/trainings, with four
-digits and a part of the fields. All of these fields except seconds are compared. A command is stopped after
+Commands are from the model cards (docs/reference/models.md). Logs are from docs/results/trainings, with four
+digits and some of the fields; all of these except seconds are compared. A command is stopped after
 `--iterations`. `conv2d-dqn` and `conv3d-dqn` fill the replay buffer until iteration 22, without learning.
-Exits with 1 if a field differs. A processor with other vector instructions (here AVX2) rounds sums
-differently, so that losses and later drives may differ.
+Exits with 1 if a field differs. A processor with other vector instructions than AVX2 rounds sums differently,
+so that losses and later drives may differ.
 """
 
 from __future__ import annotations

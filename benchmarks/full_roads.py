@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,6 +13,7 @@ from sumo_scenarios.roads import NAMED
 
 FULL = 1.0  # share of the nominal capacity that is wanted at least
 EACH = 2  # roads of a kind
+KINDS = tuple(NAMED)
 
 
 class FullRoad(NamedTuple):
@@ -23,9 +24,9 @@ class FullRoad(NamedTuple):
     folder: Path
 
 
-def full_roads(each: int, folder: Path) -> Iterator[FullRoad]:
-    """The first full roads of the validation seeds, `each` of every kind, written to `folder`."""
-    wanted = Counter(dict.fromkeys(NAMED, each))
+def full_roads(each: int, folder: Path, kinds: Collection[str] = KINDS) -> Iterator[FullRoad]:
+    """The first full roads of the validation seeds, `each` of these kinds, written to `folder`."""
+    wanted = Counter(dict.fromkeys(kinds, each))
     for seed in TUNING_SEEDS:
         drawn = draw(seed)
         if drawn.level >= FULL and wanted[drawn.road.kind]:

@@ -17,7 +17,7 @@ from statistics import fmean
 from typing import Any, NamedTuple
 
 from benchmarks.drives import Case, measure
-from benchmarks.full_roads import EACH, FullRoad, full_roads
+from benchmarks.full_roads import EACH, KINDS, FullRoad, full_roads
 from benchmarks.tables import markdown_row, write_page
 from cosim.report.statistics import paired_change
 from sumo_scenarios.roads import NAMED
@@ -32,7 +32,9 @@ RULES: dict[str, dict[str, object]] = {
     "2 m/s slower": {"EASE": 2.0},
     "8 m/s slower": {"EASE": 8.0},
     "for 15 s": {"HOLD": 15.0, "REST": 0.0},
-    "two between": {"MAX_BETWEEN": 2, "GAPS": (2.0, 80.0)},
+    "for vehicles above 10 m/s": {"LEAST_SPEED": 10.0},
+    "above 10 m/s, two between": {"LEAST_SPEED": 10.0, "MAX_BETWEEN": 2, "GAPS": (2.0, 80.0)},
+    "above 10 m/s, 8 m/s slower": {"LEAST_SPEED": 10.0, "EASE": 8.0},
     "signals alone": {"PATIENCE": NEVER},
     "lines after 15 s": {"PATIENCE": 15.0},
 }
@@ -121,6 +123,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--each", type=int, default=EACH, metavar="N", help="roads of a kind")
+    parser.add_argument("--kinds", nargs="*", default=KINDS, choices=KINDS, metavar="KIND")
     parser.add_argument("--rules", nargs="*", default=[*RULES], choices=[*RULES], metavar="NAME")
     parser.add_argument("--duration", type=float, metavar="S", help="for a folder of its own")
     parser.add_argument("--workers", type=int, default=2, metavar="N")
@@ -128,7 +131,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=RESULTS, metavar="FOLDER")
     args = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as folder:
-        roads = [*full_roads(args.each, Path(folder))]
+        roads = [*full_roads(args.each, Path(folder), args.kinds)]
         cases = [case(driver, road, args.duration) for road in roads for driver in (CAR, *args.rules)]
         rows = measure(Drive, cases, args.workers, args.out / DATA, args.again)
     write_page(args.out / PAGE, page(rows))

@@ -14,6 +14,7 @@ from policy.inputs.needs import Need, Needs
 GAPS = 2.0, 40.0  # m to its rear, at least and at most: an AV nearer would stand beside it
 MAX_BETWEEN = 0  # vehicles between both
 EASE = 4.0  # m/s below its speed
+LEAST_SPEED = 0.0  # m/s, of a vehicle that signals: where traffic crawls, vehicles merge in turn anyway
 PATIENCE = 5.0  # s that a vehicle has waited at its line before an AV with priority yields
 ARRIVAL = 8.0  # s until the AV's own arrival at the line, at least
 HOLD, REST = 8.0, 6.0  # s of yielding at most, and then without it
@@ -51,7 +52,9 @@ class YieldRule(Idm):
             can_slow = history.ego_speed**2 < 2.0 * APPROACH_DECEL * need.gap
             fits = can_slow and need.waited >= PATIENCE
         else:
-            fits = need.between <= MAX_BETWEEN and GAPS[0] <= need.gap <= GAPS[1]
+            fits = (
+                need.between <= MAX_BETWEEN and need.speed >= LEAST_SPEED and GAPS[0] <= need.gap <= GAPS[1]
+            )
         began = self._began.get((av, need.vehicle))
         if not fits or (began is None and now < self._rests.get(av, 0.0)):
             return False

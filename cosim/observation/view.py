@@ -41,6 +41,7 @@ class View(NamedTuple):
         rules: the law on its own route: signals, stop lines, crossings, limits.
         age: [R] s since the newest measurement of each row's vehicle; 0 with ideal sensing.
         source: [R] `cosim.types.Source` of that measurement.
+        indicator: [R] turn indicator then: +1 left, -1 right, 0 off.
         decision_latency: s until an action given now acts; the command before holds until then.
     """
 
@@ -61,6 +62,7 @@ class View(NamedTuple):
     rules: RulesAhead
     age: Floats
     source: npt.NDArray[np.int8]
+    indicator: npt.NDArray[np.int8]
     decision_latency: float
 
     @property
@@ -87,6 +89,7 @@ class Packed(NamedTuple):
     lines: Floats32  # [B,3,P,2]
     age: Floats  # [B,R]
     source: npt.NDArray[np.int8]  # [B,R]
+    indicator: npt.NDArray[np.int8]  # [B,R]
 
 
 class Packer:
@@ -132,6 +135,7 @@ class Packer:
             lines=lines,
             age=_by_row([h.age for h in everyone], everyone, np.float64),
             source=_by_row([h.source for h in everyone], everyone, np.int8),
+            indicator=_by_row([h.indicator for h in everyone], everyone, np.int8),
         )
 
 
@@ -176,6 +180,7 @@ class Unpacker:
             time=time,
             age=packed.age[b],
             source=packed.source[b],
+            indicator=packed.indicator[b],
             decision_latency=latency,
             rules=RulesAhead(
                 *(chr(int(state)).strip("\0"), signal_distance, int(signal), switch, stop, bool(all_way)),

@@ -97,7 +97,9 @@ _BEGUN = {
             "speed_limit": 25.0,
             "conflict_distance": 326.16,
             "signal": "",
-            "vehicles": [{**_SEEN, "is_av": 0.0, "is_mission": 0.0, "age": 0.0, "source": "truth"}],
+            "vehicles": [
+                {**_SEEN, "is_av": 0.0, "is_mission": 0.0, "age": 0.0, "source": "truth", "indicator": 0}
+            ],
         }
     },
     "events": {"collisions": [], "interventions": [], "errors": []},

@@ -21,7 +21,7 @@ _LAW = ("signal_distance", "stop_distance", "yield_distance", "crossing_distance
 def view(seen: View) -> dict[str, Any]:
     """What one AV sees now: m, m/s, rad, s; others in its own frame (x ahead, y to the left)."""
     rules, rows = seen.rules, np.round(seen.kinematics[-1].astype(np.float64), DECIMALS).tolist()
-    ages, sources = np.round(seen.age, DECIMALS).tolist(), [SOURCES[k] for k in seen.source.tolist()]
+    columns = np.round(seen.age, DECIMALS).tolist(), seen.source.tolist(), seen.indicator.tolist()
     x, y, heading = seen.pose.tolist()
     return {
         "time": seen.time,
@@ -43,9 +43,12 @@ def view(seen: View) -> dict[str, Any]:
         **{name: _ahead(getattr(rules, name)) for name in _LAW},
         "limits": [[_ahead(at), _ahead(limit)] for at, limit in rules.limits.tolist()],
         "vehicles": [
-            {"id": name, **dict(zip(KINEMATIC_FEATURES, row, strict=True)), "age": age, "source": source}
-            for name, row, known, age, source in zip(
-                seen.ids, rows, seen.valid[-1].tolist(), ages, sources, strict=True
+            {
+                **{"id": name, **dict(zip(KINEMATIC_FEATURES, row, strict=True))},
+                **{"age": age, "source": SOURCES[source], "indicator": indicator},
+            }
+            for name, row, known, age, source, indicator in zip(
+                seen.ids, rows, seen.valid[-1].tolist(), *columns, strict=True
             )
             if known
         ],
@@ -92,6 +95,7 @@ def snapshot(now: Snapshot) -> dict[str, Any]:
                 "actor": Actor(now.actor[k]).name.lower(),
                 "mission": bool(now.mission[k]),
                 "lane": int(now.lane[k]),
+                "indicator": int(now.indicator[k]),
                 **{column: values[k] for column, values in columns.items()},
             }
             for k, name in enumerate(now.ids)

@@ -26,7 +26,7 @@ from cosim.types import IDENTITY, Collision, Due, EpisodeResult, Events, Metric,
 MEDIA = "application/vnd.cosim.step"  # what a client accepts that wants bytes
 _DOCUMENT = "document"  # the key of the metadata
 Arrays = Mapping[str, npt.NDArray[Any]]
-_PACKED = ("maps", "new_maps", "kinematics", "valid", "numbers", "limits", "lanes", "lines", "age", "source")
+_PACKED = tuple(name for name in Packed._fields if name not in ("avs", "newcomers", "ids"))
 _EVENTS = typing.get_type_hints(Events)
 
 

@@ -12,7 +12,8 @@ from sumo_scenarios.draw import draw, write
 from sumo_scenarios.roads import NAMED
 
 FULL = 1.0  # share of the nominal capacity that is wanted at least
-EACH = 2  # roads of a kind
+LARGEST = 2500.0  # vehicles/h wanted at most: a drive of twice the vehicles costs more than two drives show
+EACH = 6  # roads of a kind
 KINDS = tuple(NAMED)
 
 
@@ -29,7 +30,7 @@ def full_roads(each: int, folder: Path, kinds: Collection[str] = KINDS) -> Itera
     wanted = Counter(dict.fromkeys(kinds, each))
     for seed in TUNING_SEEDS:
         drawn = draw(seed)
-        if drawn.level >= FULL and wanted[drawn.road.kind]:
+        if drawn.level >= FULL and drawn.per_hour <= LARGEST and wanted[drawn.road.kind]:
             wanted[drawn.road.kind] -= 1
             yield FullRoad(seed, drawn.road.kind, write(seed, folder))
         if not wanted.total():

@@ -31,8 +31,8 @@ def estimate(plan: Plan, engine: Engine, workers: int) -> tuple[float | None, st
     """
     costs = probe(_chosen(plan.cells), engine)
     if not costs:
-        return None, "no short episode came through: see the rows' errors in a real run"
-    driven = [(cell.scenario.duration, _like(cell, costs)) for cell in plan.cells if cell.refused is None]
+        return None, "every short episode failed: the rows of a real run have the errors"
+    driven = [(cell.scenario.duration, _cost_of(cell, costs)) for cell in plan.cells if cell.refused is None]
     total = sum(cost.start + len(plan.seeds) * (cost.reset + cost.second * s) for s, cost in driven)
     basis = f"{len(costs)} of {len(plan.cells)} cells driven for {PROBE_TIME:g} s just now, {workers} workers"
     return total / workers, basis
@@ -61,7 +61,7 @@ def probe(cells: Sequence[Cell], engine: Engine) -> dict[tuple[str, str], Cost]:
 
 
 def _chosen(cells: Sequence[Cell]) -> list[Cell]:
-    """One cell of each scenario and policy, different policies first."""
+    """At most `MAX_PROBES` cells: one of each scenario and policy, different policies first."""
     found: dict[str, dict[str, Cell]] = {}
     for cell in cells:
         if cell.refused is None:
@@ -70,9 +70,9 @@ def _chosen(cells: Sequence[Cell]) -> list[Cell]:
     return [cell for mixed in rounds for cell in mixed if cell is not None][:MAX_PROBES]
 
 
-def _like(cell: Cell, costs: dict[tuple[str, str], Cost]) -> Cost:
+def _cost_of(cell: Cell, costs: dict[tuple[str, str], Cost]) -> Cost:
     """The cost of the same scenario and policy, else the mean of the policy, else of all."""
     if known := costs.get((cell.case.what, cell.case.policy)):
         return known
-    alike = [cost for (_, policy), cost in costs.items() if policy == cell.case.policy] or [*costs.values()]
-    return Cost(*map(fmean, zip(*map(astuple, alike), strict=True)))
+    same = [cost for (_, policy), cost in costs.items() if policy == cell.case.policy] or [*costs.values()]
+    return Cost(*map(fmean, zip(*map(astuple, same), strict=True)))

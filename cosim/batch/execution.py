@@ -22,7 +22,7 @@ MAX_FAULTS = 10  # internal errors before a batch stops
 def asked(folder: Path, url: str | None) -> tuple[list[EpisodeOptions], range]:
     """The case of every cell and the seeds of the run in a folder, or in the database `url`.
 
-    Raises BadInput when there is none.
+    Raises BadInput without a run.
     """
     if url is not None or (folder / FILE).is_file():
         with Store.in_folder(folder, url) as store:
@@ -57,7 +57,7 @@ def begin_or_grow(plan: Plan, store: Store, document: Mapping[str, Any], *, resu
     first, end = store.document()["seeds"]
     check_same(replace(plan, seeds=range(first, end)), store)
     if plan.seeds.start != first or plan.seeds.stop < end:
-        problem = f"the run has the seeds {first}:{end}: it can grow, not begin elsewhere or shrink"
+        problem = f"the run has the seeds {first}:{end}: it can only get more seeds at the end"
         raise BadInput(problem, field="--resume", value=f"{plan.seeds.start}:{plan.seeds.stop}")
     store.note("seeds", [first, plan.seeds.stop], plan.spec_hash)
 
@@ -75,7 +75,7 @@ def begin(plan: Plan, store: Store, document: Mapping[str, Any]) -> None:
 def check_same(plan: Plan, store: Store) -> None:
     """Raises BadInput unless the store has this plan, with the same files and versions."""
     if store.spec_hash() != plan.spec_hash:
-        problem = "holds the run of another spec: name another folder, or no spec to go on with its own"
+        problem = "holds the run of another spec: name another folder, or no spec to continue that run"
         raise BadInput(problem, field="--resume")
     known = store.cells()
     for cell in plan.cells:
@@ -116,7 +116,7 @@ def drive(plan: Plan, store: Store, engine: Engine, outputs: Path, progress: Pro
                 continue
             faults.append(outcome)
             if len(faults) == MAX_FAULTS:
-                raise CosimError(f"stopped at the {MAX_FAULTS}th fault of our own: {outcome.stderr}")
+                raise CosimError(f"stopped at the {MAX_FAULTS}th internal error: {outcome.stderr}")
     return faults
 
 
@@ -136,7 +136,7 @@ class _Common:
         self._notes = {name: dict(store.document().get(name, {})) for name in ("units", "better")}
 
     def check(self, cell: Cell, document: Mapping[str, Any]) -> None:
-        """One episode's document. Raises BadInput when its manifest is not that of the cell."""
+        """Compare one episode's document. Raises BadInput when its manifest differs from the cell's."""
         found = {k: v for k, v in document["manifest"].items() if k != "seed"}
         known = self._manifests[cell.name]
         _compare(known, found, cell, "in a worker")
@@ -150,15 +150,17 @@ class _Common:
 
 
 def _compare(known: Mapping[str, Any], found: Mapping[str, Any], cell: Cell, where: str) -> None:
-    """Compare the common fields: some are known to workers only."""
+    """Compare the common fields, since some are known only to workers. Raises BadInput."""
     for name in known.keys() & found.keys():
         a, b = known[name], found[name]
         if isinstance(a, Mapping) and isinstance(b, Mapping):
             differing = next((k for k in sorted({*a, *b}) if a.get(k) != b.get(k)), None)
             if differing is not None:
-                problem = f"is another one {where}: {b.get(differing)!r}, it was {a.get(differing)!r}"
+                problem = f"has changed {where}: it is {b.get(differing)!r}, it was {a.get(differing)!r}"
                 if name == POLICY_FILES:
                     raise BadInput(problem, file=differing, field="policy", value=label(cell.case.policy))
                 raise BadInput(problem, file=cell.scenario.config, field=f"{name}.{differing}")
         elif a != b:
-            raise BadInput(f"is {b!r} {where}, it was {a!r}", file=cell.scenario.config, field=name)
+            raise BadInput(
+                f"has changed {where}: it is {b!r}, it was {a!r}", file=cell.scenario.config, field=name
+            )

@@ -1,4 +1,4 @@
-"""The folder of a run: made, locked, checked for disk space before anything is run, removed if that fails."""
+"""The folder of a run: created, locked and checked for disk space before the first episode."""
 
 import contextlib
 import os
@@ -18,8 +18,8 @@ class RunFolder(contextlib.AbstractContextManager["RunFolder"]):
     """Holds the lock on a run folder until `close`.
 
     Raises:
-        BadInput: the path cannot be made or written, has no space for `episodes`, is in use by another
-            process, or holds results already (without `resume`).
+        BadInput: the folder cannot be created or written, has no space for `episodes`, is in use by another
+            process, or holds results already (without `resume`). A created folder is removed again.
     """
 
     def __init__(self, path: str, *, resume: bool, episodes: int) -> None:
@@ -31,7 +31,8 @@ class RunFolder(contextlib.AbstractContextManager["RunFolder"]):
             self._lock = lock(self.path, "--out", path)
             held = [name for name in RESULTS if (self.path / name).exists()]
             if held and not resume:
-                raise self._wrong(f"holds {held[0]} already: go on with --resume, or name another folder")
+                problem = f"holds {held[0]} already: continue with --resume, or name another folder"
+                raise BadInput(problem, field="--out", value=path)
             self._check_space(max(episodes * EPISODE_BYTES, MIN_BYTES))
         except BaseException:
             self._remove_made()
@@ -73,7 +74,7 @@ class RunFolder(contextlib.AbstractContextManager["RunFolder"]):
                 folder.rmdir()
 
     def _check_space(self, size: int) -> None:
-        """Check the free space with a temporary file of the results' largest size."""
+        """Check the free space with a temporary file of `size` bytes, the largest size of the results."""
         probe = self.path / ".space.part"
         with self._cannot(f"hold the results ({size / 1e6:.0f} MB at most)"):
             try:
@@ -84,6 +85,3 @@ class RunFolder(contextlib.AbstractContextManager["RunFolder"]):
 
     def _cannot(self, doing: str) -> AbstractContextManager[None]:
         return cannot(doing, field="--out", value=self._shown)
-
-    def _wrong(self, problem: str) -> BadInput:
-        return BadInput(problem, field="--out", value=self._shown)

@@ -91,7 +91,7 @@ def drives(case: EpisodeOptions) -> bool:
 def plan(cases: Iterable[EpisodeOptions], seeds: range, check_policy: CheckPolicy) -> Plan:
     """Load and vet every cell.
 
-    A net that would kill SUMO costs its own cells only: they become `refused`.
+    Cells with a net that would crash SUMO become `refused`; the others are driven.
 
     Raises:
         BadInput: any other fault of a cell: an unknown policy, demand, output or vehicle type, or a demand

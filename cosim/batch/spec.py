@@ -34,12 +34,12 @@ class Spec:
 
     @property
     def episodes(self) -> int:
-        """How many episodes the matrix has."""
+        """Number of episodes in the matrix."""
         first, end = self.seeds
         return math.prod(map(len, self.values.values())) * (end - first)
 
     def options(self) -> Iterator[EpisodeOptions]:
-        """Of every cell's first seed."""
+        """The options of every cell, with the first seed."""
         for values in itertools.product(*self.values.values()):
             yield EpisodeOptions(**dict(zip(self.values, values, strict=True)), seed=self.seeds[0])
 
@@ -146,7 +146,7 @@ def _checked(spec: Spec, file: object) -> Spec:
             raise BadInput(f"no such scenario{hint(name, known)}", file=file, field="scenario", value=name)
     labels = [policy_name.label(text) for text in spec.values.get("policy", ())]
     if twice := next((name for name in labels if labels.count(name) > 1), None):
-        raise BadInput(f"two are called {twice}: label them, LABEL=...", file=file, field="policy")
+        raise BadInput(f"two policies are called {twice}: label them, LABEL=...", file=file, field="policy")
     if spec.episodes > MAX_EPISODES:
         problem = f"{spec.episodes} episodes are more than {MAX_EPISODES}"
         first, end = spec.seeds

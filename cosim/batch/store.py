@@ -55,7 +55,7 @@ _schemas = sa.Table(
     sa.Column("part", sa.String(32), primary_key=True),
     sa.Column("version", sa.Integer, nullable=False),
 )
-_FIRST = 1  # version of tables that were made before versions were kept
+_UNVERSIONED = 1  # version of tables without an entry in `_schemas`
 # How soon libpq notices that a connection is lost: s, s, s, number, ms.
 _LIBPQ = {"connect_timeout": 10, "keepalives_idle": 5, "keepalives_interval": 2, "keepalives_count": 3}
 _LIBPQ |= {"tcp_user_timeout": 10_000}
@@ -185,10 +185,10 @@ class Store(contextlib.AbstractContextManager["Store"]):
             with self._engine.begin() as connection:
                 yield connection
         except IntegrityError as error:
-            problem = f"an episode was to be kept twice: {_first_line(error)}"
+            problem = f"an episode is stored already: {_first_line(error)}"
             raise CosimError(f"{self._shown}: {problem}") from None
         except SQLAlchemyError as error:
-            problem = f"cannot write: {_first_line(error)} (--resume goes on from here)"
+            problem = f"cannot write: {_first_line(error)} (--resume continues from here)"
             raise CosimError(f"{self._shown}: {problem}") from None
 
     def _read(self, query: sa.Select[Any]) -> list[sa.Row[Any]]:
@@ -204,7 +204,7 @@ def connect(url: str, tables: sa.MetaData, field: str = "--store") -> sa.Engine:
     try:
         libpq = sa.engine.make_url(url).get_dialect().driver in ("psycopg", "psycopg2")
         with extra("postgresql", field=field, value=shown(url)):
-            # a connection may have been lost meanwhile
+            # pre_ping: a pooled connection may have been lost
             engine = sa.create_engine(url, pool_pre_ping=True, connect_args=_LIBPQ if libpq else {})
         if engine.dialect.name == "sqlite":
             sa.event.listen(engine, "connect", _sqlite)
@@ -212,7 +212,7 @@ def connect(url: str, tables: sa.MetaData, field: str = "--store") -> sa.Engine:
         if found != needed:
             engine.dispose()
             age = "an older" if found < needed else "a newer"
-            problem = f"its tables are those of {age} cosim: version {found}, this one has {needed}"
+            problem = f"its tables are from {age} cosim: version {found}, this cosim needs {needed}"
             raise BadInput(problem, field=field, value=shown(url))
         tables.create_all(engine)
     except ArgumentError:
@@ -224,18 +224,21 @@ def connect(url: str, tables: sa.MetaData, field: str = "--store") -> sa.Engine:
 
 
 def _version(engine: sa.Engine, tables: sa.MetaData) -> int:
-    """The version of these tables in a database; where there are none yet it is noted down as ours."""
+    """The version of these tables in a database; without any, the version of `tables` is entered."""
     there = {*sa.inspect(engine).get_table_names()}
     if there.isdisjoint(tables.tables):
         _schemas.create(engine, checkfirst=True)
-        with contextlib.suppress(IntegrityError), engine.begin() as connection:  # two may begin at once
+        with (
+            contextlib.suppress(IntegrityError),
+            engine.begin() as connection,
+        ):  # another process may do the same
             connection.execute(_schemas.insert().values(**tables.info))
     elif _schemas.name not in there:
-        return _FIRST
+        return _UNVERSIONED
     with engine.connect() as connection:
         noted = sa.select(_schemas.c.version).where(_schemas.c.part == tables.info["part"])
         found = connection.execute(noted).scalar()
-    return _FIRST if found is None else int(found)
+    return _UNVERSIONED if found is None else int(found)
 
 
 def shown(url: str) -> str:
@@ -246,7 +249,7 @@ def shown(url: str) -> str:
 def _sqlite(connection: Any, _: object) -> None:
     cursor = connection.cursor()
     cursor.execute("PRAGMA journal_mode=WAL")
-    cursor.execute("PRAGMA synchronous=NORMAL")  # whole after kill -9; a power cut may cost the last rows
+    cursor.execute("PRAGMA synchronous=NORMAL")  # complete after kill -9; a power cut may lose the last rows
     cursor.execute("PRAGMA busy_timeout=30000")  # ms
     cursor.close()
 

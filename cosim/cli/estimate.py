@@ -57,7 +57,7 @@ def work(args: argparse.Namespace) -> int:
         raise BadInput("name the run's folder", field="--out")
     go_on = evaluate.continued(args)
     if go_on and args.tilt is not None:
-        raise BadInput("a run goes on with its own tilt", field="--tilt", value=args.tilt)
+        raise BadInput("a run continues with its own tilt", field="--tilt", value=args.tilt)
     if not (go_on or args.episodes or args.seeds or args.spec):
         raise BadInput("say how many: more episodes, a narrower interval", field="--episodes")
     cases, seeds = evaluate.asked(args)

@@ -136,7 +136,7 @@ class _Counter:
         self._known: dict[str, tuple[str, Kind, bool, Size]] = {}  # id -> type, kind, mission, size
         self._unknown_types: set[str] = set()
         self._laneless = self._rows = 0  # vehicle frames
-        self._strange: Counter[str] = Counter()  # lanes that the road lacks
+        self._unknown_lanes: Counter[str] = Counter()  # lanes that the road lacks
         self._jumps = 0  # lane changes between two frames
         self._jumped: dict[str, float] = {}  # vehicle -> s of the last jump, within `SETTLING_TIME`
         self._driven = self._moved = 0.0  # m, by the speeds and by the positions
@@ -199,8 +199,7 @@ class _Counter:
         index = self._road.index
         self._laneless += sum(math.isnan(r.pos) for r in rows)
         self._rows += len(rows)
-        strange = [r.lane for r in rows if not math.isnan(r.pos) and r.lane not in index]
-        self._strange.update(strange)
+        self._unknown_lanes.update(r.lane for r in rows if not math.isnan(r.pos) and r.lane not in index)
         return Snapshot(
             time=step.time,
             ids=tuple(r.id for r in rows),
@@ -241,7 +240,7 @@ class _Counter:
         if self._newest is None:
             self._began = snapshot.time
         elif self._driven < MIN_CHECK_DISTANCE:
-            self._doubt(self._newest, snapshot)
+            self._check_positions(self._newest, snapshot)
         self._frames += 1
         self._newest = snapshot
 
@@ -269,12 +268,10 @@ class _Counter:
         """The frame without the vehicles that jumped in the last `SETTLING_TIME` s."""
         s = snapshot
         kept = np.array([row for row, name in enumerate(s.ids) if name not in self._jumped], np.int64)
-        if len(kept) == s.n:
-            return s
-        return s.only(kept)
+        return s if len(kept) == s.n else s.only(kept)
 
-    def _doubt(self, before: Snapshot, after: Snapshot) -> None:
-        """Detect positions in degrees: they hardly change while the speeds are those of cars."""
+    def _check_positions(self, before: Snapshot, after: Snapshot) -> None:
+        """Raises BadInput for positions in degrees, which hardly change at the speeds of cars."""
         elapsed = after.time - before.time
         for i, name in enumerate(after.ids):
             j = before.row.get(name)
@@ -282,7 +279,7 @@ class _Counter:
                 self._driven += after.speed[i] * elapsed
                 self._moved += math.hypot(after.x[i] - before.x[j], after.y[i] - before.y[j])
         if self._driven >= MIN_CHECK_DISTANCE and self._moved < 0.01 * self._driven:
-            problem = "positions do not move with the speeds: degrees (fcd-output.geo)? metres are needed"
+            problem = "positions do not fit the speeds: degrees (fcd-output.geo)? metres are needed"
             raise self._wrong(problem, "vehicle.x")
 
     def finish(self, has_road: bool, has_sizes: bool) -> Analysis:
@@ -292,10 +289,10 @@ class _Counter:
             self._count(self._snapshot(self._first))
         if not self._known or self._newest is None:
             whole = math.isinf(self._begin) and math.isinf(self._end)
-            raise self._wrong("holds no vehicle" + ("" if whole else " in the time that was asked for"))
-        if self._strange.total() > 0.5 * self._rows:
+            raise self._wrong("holds no vehicle" + ("" if whole else " in the requested time"))
+        if self._unknown_lanes.total() > 0.5 * self._rows:
             problem = "no such lane in --net, which is not the net of this file"
-            raise self._wrong(problem, "vehicle.lane", self._strange.most_common(1)[0][0])
+            raise self._wrong(problem, "vehicle.lane", self._unknown_lanes.most_common(1)[0][0])
         figures = dict(itertools.chain.from_iterable(m.result().items() for m in self._metrics.values()))
         return Analysis(
             figures,
@@ -317,17 +314,17 @@ class _Counter:
     def _notes(self, has_road: bool, has_sizes: bool) -> list[str]:
         apart = self._stride * self._interval  # s between frames
         everybody, size = self._roles.everybody, f"{DEFAULT.length:g} x {DEFAULT.width:g} m"
-        types, lanes = (", ".join(sorted(names)[:5]) for names in (self._unknown_types, self._strange))
+        types, lanes = (", ".join(sorted(names)[:5]) for names in (self._unknown_types, self._unknown_lanes))
         notes = {
             "every vehicle is watched (--av-type, --av-ids and --mission say otherwise)": everybody,
             "no vehicle is an AV or a mission vehicle: nothing to count": not (everybody or self._watched),
             f"every vehicle is taken as {size} (--types FILE says otherwise)": not has_sizes,
             f"not in --types, taken as {size}: {types}": has_sizes and bool(types),
-            "without --net: vehicles on and below a bridge count as meeting, headways end with the lane": (
+            "without --net: conflicts include vehicles on and below a bridge, headways end with the lane": (
                 not has_road
             ),
             f"{self._laneless} vehicle frames have no lane position: no headway there": bool(self._laneless),
-            f"{self._strange.total()} vehicle frames on lanes that --net lacks: {lanes}": bool(lanes),
+            f"{self._unknown_lanes.total()} vehicle frames on lanes that --net lacks: {lanes}": bool(lanes),
             f"{self._jumps} lane changes that took no time (lanechange.duration 0): no time to collision and "
             f"no DRAC of that vehicle for {SETTLING_TIME:g} s": bool(self._jumps),
             f"steps of {self._interval:g} s are thinned to frames of {apart:g} s": self._stride > 1,

@@ -94,7 +94,7 @@ class Encounters:
             columns = type(mine)(*(np.asarray(value)[:, None] for value in mine))
             ttc = time_to_collision(columns, boxes(s), self._critical)  # [k,n] s
             for k, j in np.argwhere(ttc < self._critical).tolist():
-                self._meet(s, int(rows[k]), j, float(ttc[k, j]))
+                self._update(s, int(rows[k]), j, float(ttc[k, j]))
         over = [pair for pair, f in self._open.items() if s.time - f.encounter.end_s > MIN_PAUSE + 1e-9]
         self._late += [self._open.pop(pair) for pair in over]
         for followed in (*self._open.values(), *self._late):
@@ -108,7 +108,8 @@ class Encounters:
         rest = [f.finish(self._interval) for f in (*self._late, *self._open.values())]
         return [asdict(e) for e in sorted([*self._closed, *rest], key=lambda e: (e.begin_s, e.ego, e.foe))]
 
-    def _meet(self, s: Snapshot, i: int, j: int, ttc: float) -> None:
+    def _update(self, s: Snapshot, i: int, j: int, ttc: float) -> None:
+        """Open or update the encounter of the vehicles in rows `i` and `j`; `ttc` in s."""
         if i == j or not self._road.connected(int(s.place[i]), int(s.place[j])):
             return
         ego, foe = s.ids[i], s.ids[j]

@@ -72,7 +72,7 @@ class _Reader:
                 raise self._wrong("a vehicle outside of a timestep", "line", line)
             row = self._row(attributes, line)
             if self._step.rows.setdefault(row.id, row) is not row:
-                problem = f"is twice in the step at {self._step.time:g} s (line {line})"
+                problem = f"appears twice in the step at {self._step.time:g} s (line {line})"
                 raise self._wrong(problem, "vehicle.id", row.id)
 
     def end(self, tag: str) -> None:

@@ -38,13 +38,14 @@ class Code(NamedTuple):
         found = getattr(module, self.member, None)
         if not callable(found):
             known = [n for n, value in vars(module).items() if callable(value) and not n.startswith("_")]
-            problem = f"nothing to call of this name{hint(self.member, known)}"
+            problem = f"no class or function of this name{hint(self.member, known)}"
             raise BadInput(problem, file=self.place, field=field, value=self.member)
         return found
 
     def make(self, field: str, *arguments: Any) -> Any:
-        """The object that the class or factory makes from `arguments`, `Guarded`. A function without
-        `arguments` is not called. Raises BadInput as `load`.
+        """The object that the class or factory makes from `arguments`, `Guarded`.
+
+        A function without `arguments` is not called. Raises BadInput as `load`.
         """
         found = self.load(field)
         place = self.file() or self.place
@@ -53,7 +54,7 @@ class Code(NamedTuple):
         return Guarded(found, place)
 
     def file(self) -> Path | None:
-        """The source file; of a module once it is loaded."""
+        """The source file; for a module, None before it is loaded."""
         if self.place.endswith(".py"):
             return Path(self.place)
         file = getattr(sys.modules.get(self.place), "__file__", None)
@@ -100,9 +101,9 @@ def read(
     if not colon:
         raise wrong(f"name the class or function in it: {text}:NAME")
     if not place.endswith(".py") and not _MODULE.fullmatch(place):
-        raise wrong("a colon belongs to FILE.py:NAME and MODULE:NAME")
+        raise wrong("FILE.py:NAME or MODULE:NAME is needed")
     if not member.isidentifier():
-        raise wrong("behind the colon stands a class, a factory or a function")
+        raise wrong("the name of a class, factory or function is needed after the colon")
     if place.endswith(".py"):
         place = os.path.abspath((folder or Path()) / os.path.expanduser(place))
         if not os.path.isfile(place):
@@ -116,7 +117,7 @@ def absolute(text: str, folder: Path, field: str, file: object = None) -> str:
 
 
 def files_of(texts: Iterable[object]) -> list[Path]:
-    """The source files of those texts that name code, once the code is loaded."""
+    """The source files of the texts that name loaded code."""
     named = [read(text, "").file() for text in texts if isinstance(text, str) and is_code(text)]
     return [file for file in named if file is not None]
 
@@ -142,7 +143,7 @@ def guarded(place: object, what: str, call: Callable[..., Any], *arguments: Any)
 
 
 def _imported(place: str) -> ModuleType:
-    """Import a module or file; a file once per process, with its folder on the path, as if it were run."""
+    """Import a module or file; a file once per process, with its folder on the path like a script's."""
     if not place.endswith(".py"):
         return importlib.import_module(place)
     path = Path(place)

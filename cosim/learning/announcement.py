@@ -1,4 +1,4 @@
-"""Messages of a training before it learns: its schedule, the start of learning, the place of the curves."""
+"""Messages of a training before its first update: schedule, start of learning, command for the curves."""
 
 import math
 import sys

@@ -37,12 +37,12 @@ HEAD = (
     "|---|---|---:|---:|---:|---:|---:|",
 )
 METHOD = """\
-The agent drives as in `cosim run`; at every decision the same network is asked again with one input replaced:
-zeroed; as at present (the newest perceived frame in place of the others); another AV's of the same instant,
-where two or more decide. Choices changed: of the action that is carried out, after the prioritizer; best
-valued changed: before it. Counts and shares of the decisions of single AVs with Wilson's 95 % intervals
-(decisions of one episode are not independent). Mean abs dq: of the five action values; spread: what the best
-value is above the second best."""
+The agent drives as in `cosim run`. At every decision the same network is evaluated again with one input
+replaced: "zeroed"; "as at present", by the newest perceived frame instead of the others; or "another AV's",
+by its input of the same time, if two or more AVs decide. Choices changed: the action that is carried out,
+after the prioritizer; best valued changed: the action before it. Counts and shares are of the decisions of
+single AVs, with Wilson's 95 % intervals (decisions of one episode are not independent). Mean abs dq: the
+mean absolute change of the five action values; spread: the best value minus the second best."""
 
 
 def questioned(policy: str) -> Questioned:
@@ -108,19 +108,19 @@ def attribution(
 ) -> None:
     """Measure the attribution; writes TABLE, PICTURE and PAGE into `out`.
 
-    `closed_loop`: also drives every episode with each of `policy.attribution.replacements`. Results are in
-    CLOSED_LOOP and a part of PAGE, with scenarios tested by the figure `by`. `replaced`: only these inputs.
-    `errors`: of the human drivers.
+    `closed_loop`: also drive every episode with each of `policy.attribution.replacements`; writes CLOSED_LOOP
+    and a part of PAGE, with a test of the figure `by` per scenario. `replaced`: only these inputs. `errors`:
+    of the human drivers.
 
     Raises BadInput as `cosim.batch.record.planned`, for a policy without a value network, for a figure
     outside of FIGURES, and for an input that a policy does not have.
     """
     if by not in FIGURES:
-        raise BadInput(f"is none of {', '.join(FIGURES)}", field="--by", value=by)
+        raise BadInput(f"must be one of {', '.join(FIGURES)}", field="--by", value=by)
     for policy in policies:
-        ways = {what[0] for what in _ways(questioned(policy))}
+        inputs = {what[0] for what in _replacements(questioned(policy))}
         for name in replaced:
-            one_of(name, sorted(ways), "--replace")
+            one_of(name, sorted(inputs), "--replace")
     asked = {"scenario": scenarios, "demand": demand or None, "policy": policies, "svo": svo_deg}
     plan = planned(seeds, **asked, duration=duration, errors=errors)
     tasks = [cell.task(case) for cell, case in plan.cases()]
@@ -139,7 +139,7 @@ def attribution(
     (out / PAGE).write_text(page, encoding="utf-8")
 
 
-def _ways(agent: PredictionAware) -> list[tuple[str, str]]:
+def _replacements(agent: PredictionAware) -> list[tuple[str, str]]:
     """The pairs (input, replacement) available for an agent."""
     return [*replacements(agent.vfn, agent.observation.frames), ORACLE]
 
@@ -150,7 +150,11 @@ def closed(plan: Plan, workers: int = 1, replaced: Sequence[str] = ()) -> Iterat
     keys = ("policy", "scenario", "seed", *SHARED, *FIGURES)
     for cell in plan.cells:
         cases = [case for one, case in plan.cases() if one is cell]
-        asked = [what for what in _ways(questioned(cell.case.policy)) if not replaced or what[0] in replaced]
+        asked = [
+            what
+            for what in _replacements(questioned(cell.case.policy))
+            if not replaced or what[0] in replaced
+        ]
         arms = [(what, case) for what in (NOTHING, *asked) for case in cases]
         tasks = [
             Task(f"{case.key} {' '.join(what)}", " ".join(what), (case, cell.scenario.warnings, what))
@@ -165,11 +169,11 @@ def closed(plan: Plan, workers: int = 1, replaced: Sequence[str] = ()) -> Iterat
 
 def closed_markdown(rows: Sequence[Mapping[str, Any]], by: str = TESTED_FIGURE) -> str:
     """Episodes with replaced inputs against episodes without, paired, as a document."""
-    page = ["## Driven with an input replaced", ""]
+    page = ["## Episodes with an input replaced", ""]
     page += [
-        "Whole episodes on equal seeds; differences to the drive with all inputs as they are, with 95 %",
-        "intervals (Tango's for shares, BCa bootstrap over pairs for means).",
-        f"p: of `{by}` by Wilcoxon's signed ranks, over the worlds by Holm's method.",
+        "Whole episodes on equal seeds. Values are differences to the episodes without a replacement, with",
+        "95 % intervals (Tango's for shares, BCa bootstrap over pairs for means). p is from Wilcoxon's",
+        f"signed ranks of `{by}`, corrected over the scenarios by Holm's method.",
         "",
     ]
     policies = dict.fromkeys(row["policy"] for row in rows)
@@ -263,7 +267,7 @@ def markdown(
         }
         never = ", ".join(name for name, x in largest.items() if x == 0.0) or "none"
         some = [f"{name} {100 * x:.2g} %" for name, x in sorted(largest.items(), key=itemgetter(1)) if x]
-        page += [f"- `{policy}`: inputs that change no choice, whatever replaces them: {never}."]
+        page += [f"- `{policy}`: inputs that change no choice, with any replacement: {never}."]
         page += [f"  Largest share of the choices that a replacement changes: {', '.join(some) or '0 %'}."]
     e = driven[0]
     drivers = (
@@ -273,7 +277,7 @@ def markdown(
     )
     count = len(driven) // len(tables)
     worlds = ", ".join(f"`{world}`" for world in dict.fromkeys(one["scenario"] for one in driven))
-    about = f"World {worlds}; demand `{e['demand']}`, {drivers}; {count} episodes a policy."
+    about = f"Scenarios {worlds}; demand `{e['demand']}`, {drivers}; {count} episodes a policy."
     page += ["", f"`{command}`", "", about, METHOD, "", f"![choices changed]({PICTURE})", ""]
     for policy, rows in tables.items():
         page += [f"## {policy}", "", *HEAD]

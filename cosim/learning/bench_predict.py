@@ -24,7 +24,7 @@ from policy.prediction.lane import along_lanes
 from policy.prediction.predictors import PREDICTORS, Predictor, make_predictor
 
 FRAME_STRIDE = 5  # frames between two moments: 1 s
-LED = "gp-lane"  # uses the road, so it is not in the table of predictors
+LANE_PREDICTOR = "gp-lane"  # uses the road, so it is not in PREDICTORS
 HORIZON, DT = 20, 0.2  # frames, s
 PAGE, MAPS_PAGE = "prediction.md", "prediction_maps.md"
 PICTURE_SCENARIO = "roundabout"  # scenario of the drawn maps, if recorded
@@ -48,9 +48,9 @@ def bench_predict(
     Raises BadInput: no recording fits, no such predictor, two of one name.
     """
     made = [make_predictor(name, HORIZON, DT) for name in predictors or PREDICTORS]
-    called = [LED, *(predictor.name for predictor in made)]
+    called = [LANE_PREDICTOR, *(predictor.name for predictor in made)]
     if twice := next((name for name in called if called.count(name) > 1), None):
-        raise BadInput("two predictors are called so", field="predictor", value=twice)
+        raise BadInput("two predictors have this name", field="predictor", value=twice)
     keys = folder.episodes(seeds)
     scores = Scores(HORIZON, DT)
     for key in shown(keys, len(keys), "bench predict", "episodes"):
@@ -103,7 +103,7 @@ def bench_maps(
     if present:
         page += ["Losses with and without history (P, figure 6):", "", "![losses](hpn_training.png)", ""]
     if shown:
-        page += ["What was predicted, what followed, and inner features (P, figures 8, 10 and 7):", ""]
+        page += ["Predicted maps, true maps, and inner features (P, figures 8, 10 and 7):", ""]
         page += [*(f"![{picture.stem}]({picture.name})" for picture in shown), ""]
     page += ["```", command, "```"] if command else []
     (out / MAPS_PAGE).write_text("\n".join(page) + "\n")
@@ -114,17 +114,17 @@ def measure(
 ) -> None:
     """Add one episode to the scores: every vehicle perceived by an AV, once a second.
 
-    With the `road`, `gp-indirect` is also carried along the lanes (LED).
+    With the `road`, `gp-indirect` is also moved along the lanes (LANE_PREDICTOR).
     """
     w = windows(recording, every=FRAME_STRIDE, horizon=scores.steps)
     forecasts = {p.name: forecast(p, w.past) for p in predictors}
     for predictor in predictors:
         if road is not None and predictor.name == "gp-indirect":
-            forecasts[LED] = led(predictor, w, road)
+            forecasts[LANE_PREDICTOR] = lane_forecast(predictor, w, road)
     scores.add(recording.case, w.future, forecasts)
 
 
-def led(predictor: Predictor, w: Windows, road: RoadMap) -> Predicted:
+def lane_forecast(predictor: Predictor, w: Windows, road: RoadMap) -> Predicted:
     """The predictor's speeds along the lanes, moment by moment; no intervals of its own."""
     parts = []
     for frame in np.unique(w.frame):
@@ -197,9 +197,9 @@ def markdown(
         "## Conditions",
         "",
         f"{len(scores.cases)} episodes, every vehicle that an AV perceives, once a second. Errors in m,",
-        "with 95 % bootstrap intervals over episodes; every scenario counts the same. The predictors know",
-        f"the last 2 s of a vehicle. `{LED}` also knows the road: it moves `gp-indirect`'s speeds along",
-        "the lanes.",
+        "with 95 % bootstrap intervals over episodes; scenarios have equal weight. The predictors know",
+        f"the last 2 s of a vehicle. `{LANE_PREDICTOR}` also knows the road: it moves `gp-indirect`'s speeds",
+        "along the lanes.",
         "The CSV files hold the rows by scenario and kind of driver.",
     ]
     return "\n".join(lines + (["", "```", command, "```"] if command else [])) + "\n"
@@ -243,7 +243,7 @@ def plot(file: Path, scores: Scores) -> None:
             there = np.isfinite(each)
             mean = (np.where(there, each, 0.0) * weight[:, None]).sum(0) / (there * weight[:, None]).sum(0)
             wide = 2.2 if name == "gp-indirect" else 1.2
-            style = ":" if name == LED else "-"
+            style = ":" if name == LANE_PREDICTOR else "-"
             axis.plot(time, mean, style, label=name, color=f"C{k}", linewidth=wide)
         axis.set_title(scenario)
         axis.set_xlabel("horizon (s)")

@@ -29,7 +29,7 @@ def configuration(name: str, beside: Path = Path(), above: tuple[Path, ...] = ()
     path = shipped / f"{name}.yaml"
     path = path if path.is_file() else beside / name
     if not path.exists():
-        problem = "no such file, and none of that name ships"
+        problem = "no such file, and no shipped configuration of this name"
         problem += hint(name, sorted(file.stem for file in shipped.glob("*.yaml")))
         where = {"file": above[-1], "field": "base"} if above else {"field": "--config"}
         raise BadInput(problem, **where, value=name)

@@ -202,7 +202,7 @@ def _verdict(compared: Sequence[Mapping[str, Any]]) -> list[str]:
     overall = {row["against"]: row for row in compared if row["scenario"] == "all"}
     row = overall.get(FORECAST)
     if row is None:
-        return ["What the HPN gains, mean over the horizons:"]
+        return ["Change by the HPN, mean over the horizons:"]
     better = row["pre_high"] < 0.0 < row["iou_low"]
     change = statistics.Figure(row["pre_change"], row["pre_low"], row["pre_high"]).text(1, 100.0)
     answer = "**Yes.**" if better else "**Not resolved.**"

@@ -43,7 +43,7 @@ def followed(
     pictures: dict[int, dict[str, Bytes]] = {}
     for number, (frame, seen) in enumerate(histories(recording, road, observation)):
         if observation.maps:
-            # a decision comes every other frame; the map of the frame before lies in its history
+            # decisions are every other frame; the history has the map of the frame in between
             for back in (1, 0):
                 pictures[frame - back] = {a: h.velocity_map[-1 - back].copy() for a, h in seen.items()}
         if number % stride == first % stride and frame + HORIZON < len(snapshots) and seen:

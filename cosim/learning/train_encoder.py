@@ -59,7 +59,7 @@ class Watcher(PredictionAware):
         self._safety = self.config.safety
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
-        """Decide every few decisions and hold the action in between."""
+        """Choose an action every few decisions and hold it in between."""
         self._count += 1
         if not histories:
             return {}
@@ -82,7 +82,7 @@ class Watcher(PredictionAware):
         self.parts.append(sight.seen(maps, kinematics, situation, ttc, past, later, self._world))
 
 
-class Watching(Hosts):
+class WatcherHost(Hosts):
     """Runs in a worker: one episode and its recorded frames."""
 
     def __init__(self, agent: AgentConfig) -> None:
@@ -113,7 +113,7 @@ def gather(agent: AgentConfig, worlds: Sequence[str], seeds: range, workers: int
         for seed in seeds
         if (seed % 2 == 1) == bool(errors)
     ]
-    each = spread(LocalEngine(Watching, (agent,), workers=workers), tasks, title)
+    each = spread(LocalEngine(WatcherHost, (agent,), workers=workers), tasks, title)
     return sight.joined([part for parts in each for part in parts])
 
 
@@ -121,7 +121,7 @@ def train(args: argparse.Namespace) -> int:
     """`cosim train encoder`. Raises BadInput for invalid input before the first episode."""
     for flag in ("iterations", "reward", "metric", "errors"):
         if getattr(args, flag):
-            raise BadInput("is not for the encoder", field=f"--{flag}", value=getattr(args, flag))
+            raise BadInput("does not apply to the encoder", field=f"--{flag}", value=getattr(args, flag))
     file = configuration(args.config).file
     training, seed, agent = file.sight, args.seed or 0, agent_config("vfn-p", file)
     worlds = [place(w) for w in args.scenario if w != "all"] or list(names())

@@ -132,7 +132,7 @@ def _checked(paths: Sequence[str], seeds: range, field: str) -> list[tuple[Path,
     wrong = sorted({s for _, key in found if (s := seed_of(key)) not in seeds})
     if wrong:
         raise BadInput(
-            f"seeds {seeds.start} to {seeds.stop - 1} are for this, not {wrong[0]} (cosim record --seeds)",
+            f"seeds {seeds.start} to {seeds.stop - 1} are needed, not {wrong[0]} (cosim record --seeds)",
             field=field,
             value=", ".join(paths),
         )
@@ -156,6 +156,6 @@ def check(args: argparse.Namespace) -> None:
     """Refuse flags that do not apply to an HPN. Raises BadInput."""
     for flag in ("iterations", "reward", "metric", "errors"):
         if getattr(args, flag):
-            raise BadInput("is not for hpn", field=f"--{flag}", value=getattr(args, flag))
+            raise BadInput("does not apply to hpn", field=f"--{flag}", value=getattr(args, flag))
     if args.scenario:
-        print("cosim: --scenario is not for hpn: the recordings say which worlds", file=sys.stderr)
+        print("cosim: --scenario does not apply to hpn: the recordings have the scenarios", file=sys.stderr)

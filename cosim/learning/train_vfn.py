@@ -41,12 +41,14 @@ def train(args: argparse.Namespace) -> int:
     if not usable(args.device):
         raise BadInput("torch has no such device here", field="--device", value=args.device)
     training = _scheduled(file.training, args)
-    reward, metrics, own = _users(training, args)
+    reward, metrics, own = _user_code(training, args)
     for lesson in training.lessons:
         load(lesson.scenario, demand=[lesson.demand], behavior=lesson.behavior)
     with working_in(args.out) as folder:
         if not args.resume and (folder / "state.json").exists():
-            raise BadInput("holds a training run already: --resume goes on", field="--out", value=args.out)
+            raise BadInput(
+                "holds a training run already: --resume continues it", field="--out", value=args.out
+            )
         about = described(name, agent, file)
         about["scenarios"] = sorted({lesson.scenario for lesson in training.lessons})
         about |= {"code": own} if own else {}
@@ -66,7 +68,7 @@ def train(args: argparse.Namespace) -> int:
                 training, agent.vfn, announced, folder, device=args.device, log=writer, about=about
             )
             if args.resume and not run.resume():
-                print("nothing to resume: starting anew", file=sys.stderr)
+                print("nothing to resume: starting a new training", file=sys.stderr)
             announced.recorded = run.trainer.replay.size
             (folder / "config.yaml").write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
             run.run(progress)
@@ -90,8 +92,10 @@ def _scheduled(training: VfnTraining, args: argparse.Namespace) -> VfnTraining:
     return replace(training, errors=errors or "", **changes)
 
 
-def _users(training: VfnTraining, args: argparse.Namespace) -> tuple[str, tuple[str, ...], dict[str, str]]:
-    """A user's own reward and metrics, checked; the user's files and their SHA-256."""
+def _user_code(
+    training: VfnTraining, args: argparse.Namespace
+) -> tuple[str, tuple[str, ...], dict[str, str]]:
+    """The checked reward and metrics of the user; SHA-256 of their files and of the error level's."""
     reward = code.absolute(args.reward, Path(), "--reward") if args.reward else ""
     metrics = tuple(code.absolute(metric, Path(), "--metric") for metric in args.metric)
     if reward:

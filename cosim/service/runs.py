@@ -434,7 +434,7 @@ class Runs:
             return str(shown(problem, self._settings))
         if isinstance(problem, CosimError):  # a store names its database, the command line's way to go on
             text = re.sub(r"\w[\w+]*://\S+?: ", "the database: ", _short(str(problem)))
-            return text.replace(" (--resume goes on from here)", "")
+            return text.replace(" (--resume continues from here)", "")
         log.error("a fault of the server's own", exc_info=problem, extra={"run": run})
         return f"a fault of the server's own: {type(problem).__name__}"
 

@@ -1,10 +1,10 @@
-"""One thread, deterministic kernels for whatever torch a policy brought (figures.md, Reproducibility)."""
+"""One thread and deterministic kernels for torch, if a policy imported it (figures.md, Reproducibility)."""
 
 import sys
 
 
 def make_torch_deterministic() -> None:
-    """Call after construction of the policy; without torch (which cosim never imports) it does nothing."""
+    """Call it after the policy is constructed; cosim itself never imports torch."""
     torch = sys.modules.get("torch")
     if torch is None:
         return

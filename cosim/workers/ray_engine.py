@@ -69,7 +69,7 @@ class RayEngine:
             yield from actors.drive(tasks, min(count, len(tasks)))
         except self._ray.exceptions.RaySystemError as error:
             leaves = leaves or self._keep  # the next run connects anew
-            raise CosimError(f"the Ray cluster is gone: {error} (--resume goes on from here)") from None
+            raise CosimError(f"the Ray cluster is gone: {error} (--resume continues from here)") from None
         finally:
             actors.close()
             if leaves:
@@ -122,7 +122,7 @@ class _Actors:
     ) -> None:
         self._ray = ray
         self._cancelled = cancelled
-        # never restarted by Ray: a fresh actor in its place is the same, and may start on another node
+        # not restarted by Ray, since a new actor may start on another node
         self._actor = ray.remote(num_cpus=1, max_restarts=0, max_task_retries=0)(_Actor)
         self._settings = (factory, arguments, limits)
         self._calls: dict[Any, tuple[Any, Task | None, str | None]] = {}  # future -> actor, task, its group
@@ -150,7 +150,10 @@ class _Actors:
                 actor, task, group = self._calls.pop(future)
                 try:
                     outcome = self._ray.get(future)
-                except (errors.RayTaskError, errors.RaySystemError):  # a bug of ours; the cluster is gone
+                except (
+                    errors.RayTaskError,
+                    errors.RaySystemError,
+                ):  # an internal error, or the cluster is gone
                     raise
                 except errors.RayError as error:  # the actor was lost, or its node with the result
                     self._ray.kill(actor)
@@ -177,7 +180,7 @@ class _Actors:
     def _assign(self, actor: Any, tasks_left: TaskQueue, group: str | None) -> None:
         task = tasks_left.take(group)
         if task is None:
-            self._ray.kill(actor)  # should another actor be lost, a new one is started in its place
+            self._ray.kill(actor)  # a new actor is started if another one is lost later
         else:
             self._calls[actor.run.remote(task)] = (actor, task, task.group)
 
@@ -188,7 +191,7 @@ class _Actors:
             tasks_left.put_back(task)
             return None
         words = " ".join(str(error).split())[:500]
-        problem = f"{MAX_LOSSES} Ray workers were lost at it: {words}"
+        problem = f"{MAX_LOSSES} Ray workers were lost with this task: {words}"
         return Outcome(task.key, SIM_CRASH, error=problem, attempts=MAX_LOSSES)
 
 
@@ -199,7 +202,7 @@ class _Actor:
         self._supervisor = Supervisor(factory, arguments, limits)
 
     def ready(self) -> None:
-        """The actor has a core and runs."""
+        """Returns when the actor has a core and runs."""
 
     def run(self, task: Task) -> Outcome:
         """One task."""

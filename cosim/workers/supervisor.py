@@ -23,7 +23,7 @@ KILLED_FROM_OUTSIDE = frozenset(-s for s in (signal.SIGKILL, signal.SIGTERM, sig
 HEARTBEAT = 1.0  # s between two heartbeats: a message per step of 2 ms would be too expensive
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
-_ENDS: dict[type[CosimError], str] = {  # the first that an error is
+_ENDS: dict[type[CosimError], str] = {  # the first class that matches an error decides
     BadInput: "refused",
     SimulationTimeout: "hung",
     SimulationCrashed: "crashed",
@@ -57,8 +57,8 @@ class Limits:
 class Supervisor:
     """Owns one worker process at a time. `run` never raises for a task's failure; it restarts the process.
 
-    To be created, used and closed by one thread: the process ends with the thread that started it
-    (PR_SET_PDEATHSIG), so that no process outlives a parent that was killed. `kill` may come from any.
+    One thread must create, use and close it: the process ends with the thread that started it
+    (PR_SET_PDEATHSIG), so that no process outlives a killed parent. Any thread may call `kill`.
     """
 
     def __init__(
@@ -97,10 +97,9 @@ class Supervisor:
             return Outcome(task.key, _STATUS[end], value, error, stderr, ends.total(), seconds)
 
     def kill(self) -> None:
-        """End the process at once, from another thread; `run` comes back and tries no more."""
+        """End the process at once, from another thread; `run` returns without another attempt."""
         self._ended = True
-        worker = self._worker
-        if worker is not None:
+        if (worker := self._worker) is not None:
             worker.kill()
 
     def close(self) -> None:
@@ -111,7 +110,7 @@ class Supervisor:
     # ---- inside ----
 
     def _attempt(self, task: Task, progress: Progress) -> tuple[str, Any, str | None, str | None]:
-        """How it ended, the value, the error in one line, stderr of the process that ended."""
+        """How the attempt ended, the value, the error in one line, and stderr of an ended process."""
         try:
             worker = self._ready()
             value = worker.call("run", task.arguments, progress=progress)
@@ -151,7 +150,7 @@ class Supervisor:
 
 
 class _WorkerSide:
-    """In the worker: builds the hosted object, sends a heartbeat a second at most, ends with its parent."""
+    """In the worker: builds the hosted object, limits heartbeats to one per second, ends with its parent."""
 
     def __init__(self, parent: int, factory: Factory, arguments: tuple[Any, ...]) -> None:
         _end_with(parent)
@@ -171,25 +170,25 @@ class _WorkerSide:
         return self._hosted.run(*arguments, progress=limited)
 
     def close(self) -> None:
-        """The process ends."""
+        """Close the hosted object, because the process ends."""
         self._hosted.close()
 
 
 def _end_with(parent: int) -> None:
     """Have the kernel kill this process when its parent ends, even during a step of SUMO."""
     if not hasattr(ctypes, "CDLL") or os.uname().sysname != "Linux":
-        return  # elsewhere the broken pipe ends it at the next heartbeat
+        return  # elsewhere the broken pipe ends this process at the next heartbeat
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:  # it was gone before we asked
+    if os.getppid() != parent:  # the parent had ended before the call
         os._exit(1)
 
 
 def _nothing(done: float, total: float) -> None:
-    """Progress of a task without a progress bar: it still reports that the process is alive."""
+    """Progress of a task without a progress bar; its calls are still heartbeats."""
 
 
 def _line(error: Exception) -> str:
-    """The error in one line: of a traceback, which keeps its place in stderr, the first and the last."""
+    """The error in one line; of a traceback the first and the last line, since stderr has all of it."""
     lines = str(error).strip().splitlines()
     if len(lines) > 1:
         lines = [lines[0], lines[-1]]

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 from cosim.errors import BadInput, CosimError, SimulationCrashed
 
 OK, SIM_CRASH, TIMEOUT, BAD_INPUT = STATUSES = ("ok", "sim_crash", "timeout", "bad_input")
-FAULT = "fault"  # our own code failed: the task has no result and should be run again once the code is fixed
+FAULT = "fault"  # internal error: the task has no result and should be run again after a fix of the code
 
 
 Progress = Callable[[float, float], None]  # a heartbeat: done, total
@@ -20,14 +20,14 @@ class Hosted(Protocol):
 
     @property
     def run(self) -> Callable[..., Any]:
-        """`run(*task.arguments, progress=...)` does one task, calling `progress` now and then: the
-        heartbeat that the supervisor waits for. Everything in and out must be picklable.
+        """`run(*task.arguments, progress=...)` does one task. It calls `progress` regularly, which is the
+        heartbeat that the supervisor waits for. Arguments and results must be picklable.
 
-        Raises BadInput or SimulationError; anything else is a fault of ours.
+        Raises BadInput or SimulationError; any other exception is an internal error.
         """
 
     def close(self) -> None:
-        """The process ends."""
+        """Called before the process ends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,7 @@ class Outcome:
     status: str  # one of STATUSES, or FAULT
     value: Any = None
     error: str | None = None  # one line
-    stderr: str | None = None  # the end of what a process that ended wrote there; of a fault, the traceback
+    stderr: str | None = None  # end of the stderr of an ended process; for FAULT the traceback
     attempts: int = 1
     seconds: float = 0.0  # wall time of the last attempt
 
@@ -56,7 +56,7 @@ class Outcome:
         return self.status == OK
 
     def result(self) -> Any:
-        """The value. Raises what the status says: BadInput, SimulationCrashed, or CosimError of our own."""
+        """The value. Raises by status: BadInput, SimulationCrashed, or CosimError for an internal error."""
         if self.ok:
             return self.value
         if self.status == BAD_INPUT:
@@ -67,9 +67,9 @@ class Outcome:
 
 
 class TaskQueue:
-    """Gives tasks to many workers, each of which stays with one group while it has tasks. Thread-safe.
+    """Gives tasks to many workers. A worker stays with one group while the group has tasks. Thread-safe.
 
-    A worker without a group gets one that no other works on, or else the one with most tasks left.
+    A worker without a group gets a group without workers, or else the group with most tasks left.
     """
 
     def __init__(self, tasks: Iterable[Task]) -> None:
@@ -80,7 +80,7 @@ class TaskQueue:
             self._groups.setdefault(task.group, deque()).append(task)
 
     def take(self, last: str | None) -> Task | None:
-        """The next task of a worker whose last one was of the group `last`; None when none is left."""
+        """The next task of a worker whose last task was of the group `last`; None without tasks."""
         with self._lock:
             if last is not None and self._groups.get(last):
                 return self._groups[last].popleft()
@@ -97,12 +97,12 @@ class TaskQueue:
             return self._groups[group].popleft()
 
     def put_back(self, task: Task) -> None:
-        """The worker of this task is lost: another one does it next."""
+        """Return the task of a lost worker; it is the next one of its group."""
         with self._lock:
             self._groups.setdefault(task.group, deque()).appendleft(task)
 
     def leave(self, last: str | None) -> None:
-        """A worker whose last task was of the group `last` takes no more."""
+        """Sign off a worker whose last task was of the group `last`."""
         with self._lock:
             if last is not None:
                 self._workers[last] -= 1

@@ -1,7 +1,8 @@
-"""A process that is not trusted with the caller's secrets, nor with the caller's pickles.
+"""A process that is not trusted: it gets no secrets of the caller, and its answers cannot run code here.
 
-It is started with few variables, no arguments of the caller's command line and no descriptors but its own;
-what it answers is read as plain data: numbers, texts, paths, arrays, errors, cosim's frozen dataclasses.
+The process starts with few environment variables, without the caller's command line and with no descriptors
+except its own. Its answers are read as plain data: numbers, texts, paths, arrays, errors, and cosim's frozen
+dataclasses.
 """
 
 from __future__ import annotations
@@ -38,25 +39,25 @@ Factory = TypeVar("Factory", bound=Callable[..., Any])
 
 
 def untrusted(factory: Factory) -> Factory:
-    """Mark what makes a `Worker`'s object: its process is not trusted."""
+    """Mark a `Worker`'s factory: its process is not trusted."""
     setattr(factory, "untrusted", True)  # noqa: B010 - a class or a function
     return factory
 
 
-def is_untrusted(*made_of: object) -> bool:
-    """Whether one of them is marked."""
-    return any(getattr(part, "untrusted", False) for part in made_of)
+def is_untrusted(*parts: object) -> bool:
+    """Whether a factory or one of its arguments is marked."""
+    return any(getattr(part, "untrusted", False) for part in parts)
 
 
 def environment() -> dict[str, str]:
-    """What such a process is told of this one's variables."""
+    """The variables of this process that an untrusted process gets."""
     return {
         name: value for name, value in os.environ.items() if name in _VARIABLES or name.startswith(_PREFIXES)
     }
 
 
 def load(answer: bytes) -> Any:
-    """What was answered. Raises UnpicklingError for what is no plain data."""
+    """The data of an answer. Raises UnpicklingError for anything but plain data."""
     return _Reader(io.BytesIO(answer)).load()
 
 
@@ -69,7 +70,7 @@ class Process(multiprocessing.get_context("spawn").Process):  # type: ignore[mis
 
 
 class _Popen(popen_spawn_posix.Popen):
-    """As multiprocessing's own, without what the process must not know."""
+    """multiprocessing's Popen, without the caller's command line, key and environment."""
 
     def _launch(self, process: BaseProcess) -> None:
         process.authkey = b""
@@ -85,7 +86,7 @@ class _Popen(popen_spawn_posix.Popen):
         ended, theirs = os.pipe()
         begin, ours = os.pipe()
         try:
-            # without the tracker of named semaphores, which would remove any for it
+            # no semaphore tracker: on request of the process it would remove any named semaphore
             command = spawn.get_command_line(tracker_fd=None, pipe_handle=begin)
             handles = (*self._fds, theirs, begin)  # type: ignore[attr-defined]
             started = subprocess.Popen(command, env=environment(), pass_fds=handles)
@@ -110,7 +111,7 @@ def _close(*handles: int) -> None:
 
 
 class _Reader(pickle.Unpickler):
-    """Nothing is imported or called that is not data."""
+    """Imports and calls only types of plain data."""
 
     def find_class(self, module: str, name: str) -> Any:
         """As `pickle.Unpickler`."""
@@ -120,7 +121,7 @@ class _Reader(pickle.Unpickler):
             found = super().find_class(module, name)
             if package != "cosim" or _is_data(found) or name == "_rebuild_bad_input":
                 return found
-        raise pickle.UnpicklingError(f"{module}.{name} is no plain data")
+        raise pickle.UnpicklingError(f"{module}.{name} is not plain data")
 
 
 def _is_data(kind: object) -> bool:

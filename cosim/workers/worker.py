@@ -26,7 +26,7 @@ from cosim.errors import CosimError, SimulationCrashed, SimulationTimeout
 from cosim.workers import untrusted
 from cosim.workers.memory import keep_freed_memory
 
-STDERR_KEPT = 4000  # characters of a process's stderr that the error of its crash holds
+STDERR_KEPT = 4000  # last characters of a crashed process's stderr, for the error
 
 _CONTEXT = multiprocessing.get_context("spawn")
 _STARTING = threading.RLock()
@@ -36,13 +36,14 @@ _BLAS_THREADS = "OPENBLAS_NUM_THREADS"  # numpy's BLAS reads it when it is loade
 class Worker(contextlib.AbstractContextManager["Worker"]):
     """`factory(*arguments)` built in a spawned process; `call` runs one of its methods there.
 
-    Everything that crosses must be picklable. `timeout` is the longest time in s without a heartbeat (a call
+    Arguments and results must be picklable. `timeout` is the longest time in s without a heartbeat (a call
     of `progress`); `start_timeout` is the longest time before the first heartbeat, of the factory and of
-    each call (default: the same). Raises whatever CosimError the method raised,
-    SimulationCrashed when the process ended, SimulationTimeout without a heartbeat. A worker whose process
-    has ended cannot be used again: make a new one. Without `wait` the first call waits for the start, and
-    raises what the factory raised. Where the factory is marked by `untrusted`, the process is none that the
-    caller believes (`cosim.workers.untrusted`).
+    each call (default: the same). A worker whose process has ended cannot be used again. Without `wait` the
+    first call waits for the start, and raises the factory's exception. The process of a factory marked by
+    `untrusted` is not trusted (`cosim.workers.untrusted`).
+
+    Raises the CosimError that the method raised, SimulationCrashed when the process ended, or
+    SimulationTimeout without a heartbeat.
     """
 
     def __init__(
@@ -59,7 +60,7 @@ class Worker(contextlib.AbstractContextManager["Worker"]):
         handle, path = tempfile.mkstemp(prefix="cosim-worker-", suffix=".stderr")
         os.close(handle)
         self._stderr = Path(path)
-        self._call_begin = 0  # bytes of it that belong to earlier calls
+        self._call_begin = 0  # bytes of stderr that belong to earlier calls
         self._pipe, theirs = _CONTEXT.Pipe()
         self._untrusted = untrusted.is_untrusted(factory, *arguments)
         self._process = (untrusted.Process if self._untrusted else _CONTEXT.Process)(
@@ -104,7 +105,7 @@ class Worker(contextlib.AbstractContextManager["Worker"]):
             self._process.kill()
 
     def close(self) -> None:
-        """Ask the worker to end, and see to it that it does. Safe to call twice."""
+        """Ask the worker to end, and kill it if necessary. Safe to call twice."""
         if self._closed:
             return
         self._closed = True
@@ -170,13 +171,13 @@ class Worker(contextlib.AbstractContextManager["Worker"]):
                 return kind, value
         except (EOFError, ConnectionResetError):
             raise
-        except Exception as error:  # whatever its bytes make of the unpickler
+        except Exception as error:  # the bytes may raise anything in the unpickler
             problem = f"{type(error).__name__}: {error}"
         else:
-            problem = "an error that is none"
+            problem = "not an error of cosim"
         self.kill()
         self.close()
-        raise SimulationCrashed(f"the simulation's process answered what is no plain data ({problem})")
+        raise SimulationCrashed(f"the answer of the simulation's process is not plain data ({problem})")
 
     def _crashed(self, method: str) -> SimulationCrashed:
         self._process.join(5.0)
@@ -199,9 +200,11 @@ class Worker(contextlib.AbstractContextManager["Worker"]):
 
 @contextlib.contextmanager
 def _script_left_out(*needed: object) -> Iterator[None]:
-    """Keep multiprocessing from running the caller's script once more in the worker, which needs nothing of
-    it unless something `needed` is defined there: so scripts need no `if __name__ == "__main__"`, and what
-    a trainer imports (torch) is not imported again beside every simulation."""
+    """Keep multiprocessing from running the caller's script in the worker, unless it defines some `needed`.
+
+    So scripts need no `if __name__ == "__main__"`, and a trainer's imports (torch) are not repeated beside
+    every simulation.
+    """
     main = sys.modules["__main__"]
     if b"__main__" in pickle.dumps(needed):
         yield
@@ -219,8 +222,10 @@ def _script_left_out(*needed: object) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _one_blas_thread() -> Iterator[None]:
-    """One thread for numpy's BLAS in a process started meanwhile, unless the user says otherwise: a second
-    one gains nothing on matrices as small as ours, and where cores are shared they wait for one another."""
+    """One thread for numpy's BLAS in processes started in the block, unless the user chose a number.
+
+    A second thread gains nothing on small matrices, and on shared cores the threads wait for one another.
+    """
     with _STARTING:
         chosen = _BLAS_THREADS in os.environ
         os.environ.setdefault(_BLAS_THREADS, "1")
@@ -234,19 +239,19 @@ def _one_blas_thread() -> Iterator[None]:
 def _serve(pipe: Connection, factory: Callable[..., Any], arguments: tuple[Any, ...], stderr: str) -> None:
     """The worker's main loop. It ends when the pipe breaks, so the worker never outlives its parent."""
     keep_freed_memory()
-    os.dup2(2, 1)  # what a policy prints goes to stderr: stdout is for the caller's document
-    file = os.open(stderr, os.O_RDWR | os.O_APPEND)  # as `cosim.simulation.stderr` wants it, to read back
+    os.dup2(2, 1)  # prints of a policy go to stderr: stdout is for the caller's document
+    file = os.open(stderr, os.O_RDWR | os.O_APPEND)  # readable, for `cosim.simulation.stderr`
     os.dup2(file, 2)
     os.close(file)
     target, done = None, False
 
     def leave() -> None:
-        """Without taking numba and torch apart, which takes longer than a short episode."""
+        """Exit without tearing down numba and torch, which takes longer than a short episode."""
         sys.stdout.flush()
         if done:
             os._exit(0)
 
-    atexit.register(leave)  # comes after every other exit function: they run in reverse order
+    atexit.register(leave)  # registered first, so it runs last
 
     def attempt(work: Callable[[], Any]) -> bool:
         try:

@@ -117,7 +117,7 @@ def test_tables_of_another_version_are_refused(tmp_path: Path, version: int, age
         make(url).close()
         with sa.create_engine(url).begin() as connection:
             connection.execute(sa.text(f"UPDATE cosim_schemas SET version = {version}"))
-        with pytest.raises(BadInput, match=f"{age} cosim: version {version}, this one has 1"):
+        with pytest.raises(BadInput, match=f"{age} cosim: version {version}, this cosim needs 1"):
             make(url)
 
 

@@ -351,7 +351,7 @@ def test_whoever_fills_the_disk_is_ended(tmp_path: Path, limits: dict[str, int])
 def test_its_answers_are_plain_data_or_none(place: Path, what: str) -> None:
     with (
         Worker(Prisoner, prison(place)) as worker,
-        pytest.raises(SimulationCrashed, match="is no plain data"),
+        pytest.raises(SimulationCrashed, match="is not plain data"),
     ):
         worker.call("answer", what)
     assert not Path("/tmp/of-a-prisoner").exists()

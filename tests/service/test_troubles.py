@@ -123,7 +123,7 @@ def test_a_full_disk_is_said_and_a_run_that_meets_it_names_no_place(
         patch.setattr(os, "posix_fallocate", raising(FULL))
         answer = client.post("/api/runs", json=SHORT)
         assert (answer.status_code, "no space left" in answer.json()["problem"]) == (507, True)
-    place = "sqlite:////srv/data/runs/0/store.sqlite: cannot write: full (--resume goes on from here)"
+    place = "sqlite:////srv/data/runs/0/store.sqlite: cannot write: full (--resume continues from here)"
     tries = []
     with monkeypatch.context() as patch:
         patch.setattr(runs, "RETRY", 0.001)
@@ -185,7 +185,7 @@ def test_what_is_wrong_with_a_run_itself_is_tried_once(
     client: httpx.Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tries = []
-    wrong = BadInput("is another one since the run began", field="policy")
+    wrong = BadInput("has changed since the run began", field="policy")
     monkeypatch.setattr(runs.execution, "check_same", lambda *_: tries.append(1) or raising(wrong)())
     assert ended(client, client.post("/api/runs", json=SHORT).json()["id"])["status"] == "failed"
     assert len(tries) == 1

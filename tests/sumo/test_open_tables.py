@@ -234,7 +234,7 @@ def test_an_encoder_is_trained_on_one_s_own_roads(
     assert len(log) == 5, "a head, and a line of each update"
     capsys.readouterr()
     assert main([*run, "--errors", "stress"]) == 2
-    assert "is not for the encoder" in capsys.readouterr().err
+    assert "does not apply to the encoder" in capsys.readouterr().err
 
 
 def test_a_predictor_is_measured_where_one_s_own_policy_drives(own: Path, tmp_path: Path) -> None:
@@ -258,5 +258,5 @@ def test_what_cannot_be_loaded_is_refused_before_anything_is_made(
     )
     words += ["--scenario", "merge", flag, f"{own}/code.py:nope", "--out", str(tmp_path / "out")]
     assert main(words) == 2
-    assert f"{flag}='nope': nothing to call of this name" in capsys.readouterr().err
+    assert f"{flag}='nope': no class or function of this name" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -166,7 +166,7 @@ def test_a_class_a_factory_and_a_function_of_ones_own_drive(code: Path, tmp_path
         ("Blind", "Blind.observation: must be a cosim.types.ObservationConfig"),
         ("Fails", "Fails: OSError: no model file"),
         ("Nothing", "Nothing: a policy needs observation, reset, decide (cosim.types.Policy)"),
-        ("number", "--policy='number': nothing to call of this name"),
+        ("number", "--policy='number': no class or function of this name"),
         ("Hold", "--policy='Hold': nothing to call of this name, did you mean 'Holds'?"),
     ],
 )
@@ -244,7 +244,7 @@ def test_a_batch_compares_ones_own_with_ours_and_knows_when_it_was_changed(
     with sqlite3.connect(out / FILE) as store:
         store.execute("delete from cosim_episodes where key = ?", [key])
     assert main(["evaluate", "--workers", "1", "--no-report", "--out", str(out), "--resume"]) == 2
-    assert "own_policy.py: policy='mine': is another one in a worker: " in capsys.readouterr().err
+    assert "own_policy.py: policy='mine': has changed in a worker: " in capsys.readouterr().err
 
 
 def test_what_stable_baselines_learned_drives_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -263,4 +263,4 @@ def test_what_stable_baselines_learned_drives_too(tmp_path: Path, monkeypatch: p
 def test_two_of_one_name_are_refused(code: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     policies = ["--policy", f"{code}:Holds", "--policy", f"Holds={code}:factory"]
     assert main(["evaluate", "--scenario", "merge", *policies, "--out", str(tmp_path / "out")]) == 2
-    assert "policy: two are called Holds: label them, LABEL=..." in capsys.readouterr().err
+    assert "policy: two policies are called Holds: label them, LABEL=..." in capsys.readouterr().err

@@ -195,7 +195,7 @@ def test_shares_are_those_of_the_decisions_of_all_episodes_and_the_page_says_wha
     assert rows[2]["choices_changed_low"] < 0.3 < rows[2]["choices_changed_high"]
     assert (rows[2]["unmasked_changed_count"], rows[2]["mean_abs_dq"], rows[2]["spread"]) == (8, 0.2, 0.5)
     page = markdown(episodes, {"x": rows}, "cosim bench attribution ...")
-    assert "`x`: inputs that change no choice, whatever replaces them: maps." in page
+    assert "`x`: inputs that change no choice, with any replacement: maps." in page
     assert "phi 30 %" in page
     assert "2 episodes a policy" in page
     answers[0].pop(("maps", "another AV's"))  # it comes in the last episode only, after another input

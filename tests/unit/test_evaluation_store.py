@@ -109,7 +109,7 @@ def test_a_resumed_run_drives_what_is_missing_and_nothing_twice(plan: matrix.Pla
         assert batch.drive(plan, store, engine, tmp_path, nothing) == []
         assert engine.driven == [plan.cells[1].case.with_seed(8).key]
         assert len(store.rows()) == 6
-        with pytest.raises(CosimError, match="kept twice"):
+        with pytest.raises(CosimError, match="stored already"):
             store.add(store.rows()[:1])
 
 
@@ -133,7 +133,7 @@ def test_another_spec_or_another_version_of_a_file_is_refused_on_resume(
             batch.check_same(replace(plan, seeds=range(7, 11)), store)
         files = {**plan.cells[0].manifest["files"], "merge.sumocfg": "00"}
         cell = replace(plan.cells[0], manifest={**plan.cells[0].manifest, "files": files})
-        with pytest.raises(BadInput, match=r"files\.merge\.sumocfg: is another one since the run began"):
+        with pytest.raises(BadInput, match=r"files\.merge\.sumocfg: has changed since the run began"):
             batch.check_same(replace(plan, cells=(cell, plan.cells[1])), store)
 
 
@@ -182,7 +182,7 @@ def test_a_database_that_fills_up_ends_the_run_with_one_sentence(plan: matrix.Pl
             pages = connection.exec_driver_sql("PRAGMA page_count").scalar_one()
             connection.exec_driver_sql(f"PRAGMA max_page_count={pages}")
         long = Outcome("", "sim_crash", stderr="x" * 100_000)
-        with pytest.raises(CosimError, match=r"cannot write: database or disk is full \(--resume goes on"):
+        with pytest.raises(CosimError, match=r"cannot write: database or disk is full \(--resume continues"):
             batch.drive(plan, store, Pretender(plan, idm_8=long), tmp_path, nothing)
         assert [(r["policy"], r["seed"]) for r in store.rows()] == [("idm", 9)], "what came before is kept"
 
@@ -226,7 +226,7 @@ def test_a_folder_in_use_or_with_results_is_refused_and_not_changed(tmp_path: Pa
         with pytest.raises(BadInput, match="another process is working in it"):
             RunFolder(str(tmp_path), resume=True, episodes=1)
         (tmp_path / "summary.json").write_text("{}")
-    with pytest.raises(BadInput, match=r"--out=.*holds summary\.json already: go on with --resume"):
+    with pytest.raises(BadInput, match=r"--out=.*holds summary\.json already: continue with --resume"):
         RunFolder(str(tmp_path), resume=False, episodes=1)
     assert [p.name for p in tmp_path.iterdir()] == ["summary.json"]
 

@@ -282,7 +282,7 @@ BAD = {
         r"vehicle.speed='nan': not a finite number",
     ),
     "no id": (following().replace('id="fast" ', "", 1), r"vehicle.id \(line 2\): is missing"),
-    "twice": (step(0, car("a", 1, 1), car("a", 9, 1)), r"vehicle.id='a': is twice in the step at 0 s"),
+    "twice": (step(0, car("a", 1, 1), car("a", 9, 1)), r"vehicle.id='a': appears twice in the step at 0 s"),
     "back in time": (step(1, car("a", 1, 1)) + step(0, car("a", 1, 1)), r"times must increase"),
     "uneven": (
         step(0, car("a", 1, 1)) + step(0.2, car("a", 1, 1)) + step(0.5, car("a", 1, 1)),
@@ -293,7 +293,7 @@ BAD = {
     "outside": (car("a", 1, 1), r"a vehicle outside of a timestep"),
     "degrees": (
         "".join(step(0.2 * k, car("a", 8.68 + 1e-5 * k, 20, y=50.1)) for k in range(80)),
-        r"positions do not move with the speeds: degrees",
+        r"positions do not fit the speeds: degrees",
     ),
 }
 

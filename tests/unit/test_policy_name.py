@@ -57,14 +57,14 @@ def test_a_module_is_no_file() -> None:
     ("text", "said"),
     [
         ("mine.py", "name the class or function in it: mine.py:NAME"),
-        ("mine.py:", "behind the colon stands a class, a factory or a function"),
+        ("mine.py:", "the name of a class, factory or function is needed"),
         ("mine.py:a-b", "behind the colon stands a class"),
         ("my label=runs/old.safetensors", "a label has letters, digits"),
         ("runs/none.safetensors", "no such file: /"),
         ("./none", "no such file: /"),
         ("new=none.py:Agent", "no such file: /"),
         ("./empty", "/empty/best.safetensors"),
-        ("./mine.py.bak:Agent", "a colon belongs to FILE.py:NAME and MODULE:NAME"),
+        ("./mine.py.bak:Agent", "FILE.py:NAME or MODULE:NAME is needed"),
         ("new=mine.py", "name the class or function in it"),
     ],
 )

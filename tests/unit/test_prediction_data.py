@@ -136,7 +136,7 @@ def arguments(folder: Path, **changes: object) -> argparse.Namespace:
 
 
 def test_training_refuses_recordings_of_the_wrong_seeds_before_it_reads_one(folder: Path) -> None:
-    with pytest.raises(BadInput, match=r"seeds 100000 to 199999 are for this, not 7 \("):
+    with pytest.raises(BadInput, match=r"seeds 100000 to 199999 are needed, not 7 \("):
         train_hpn.train(arguments(folder))
     with pytest.raises(BadInput, match="recordings to train"):
         train_hpn.train(arguments(folder, recordings=[]))
@@ -150,9 +150,9 @@ def test_the_command_line_trains_no_hpn_on_recordings_of_the_wrong_seeds(
 ) -> None:
     words = ["--recordings", str(folder), "--validation", str(folder), "--out", str(folder / "run")]
     assert main(["train", "hpn", *words]) == 2
-    assert "seeds 100000 to 199999 are for this, not 7 (" in capsys.readouterr().err
+    assert "seeds 100000 to 199999 are needed, not 7 (" in capsys.readouterr().err
     assert main(["train", "hpn", *words, "--errors", "stress"]) == 2
-    assert "--errors='stress': is not for hpn" in capsys.readouterr().err
+    assert "--errors='stress': does not apply to hpn" in capsys.readouterr().err
 
 
 def test_examples_of_both_kinds_come_from_a_recording(folder: Path) -> None:

@@ -48,7 +48,7 @@ def test_a_file_changes_only_what_it_says_of_its_base(tmp_path: Path) -> None:
     [
         (
             "base: paperz",
-            "mine.yaml: base='paperz': no such file, and none of that name ships, did you mean 'paper'?",
+            "mine.yaml: base='paperz': no such file, and no shipped configuration of this name, did",
         ),
         ("base: [papers]", "mine.yaml: base=['papers']: the name of a configuration"),
         ("base: other.yaml", "other.yaml: base='mine.yaml': is its own base"),
@@ -63,7 +63,7 @@ def test_a_file_changes_only_what_it_says_of_its_base(tmp_path: Path) -> None:
             "observation='compct': must be one of compact, paper, smoke, did you mean 'compact'",
         ),
         ("safety: {critical_th: -3}", "safety.critical_th=-3.0: must be 0 or more"),
-        ("svo: 1\nsvo: 2", "mine.yaml: line=2: not YAML: 'svo' is twice in this mapping"),
+        ("svo: 1\nsvo: 2", "mine.yaml: line=2: not YAML: 'svo' appears twice in this mapping"),
         ("base: papers\ntraining: 3", "mine.yaml: training=3: a mapping is needed"),
     ],
 )

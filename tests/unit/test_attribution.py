@@ -203,7 +203,7 @@ def test_shares_are_those_of_the_decisions_of_all_episodes_and_the_page_says_wha
     episodes[1]["answers"] = {keys[0]: np.array(sums[0]), keys[2]: np.array(sums[2]), keys[1]: late}
     rows = table(episodes)
     assert [(row["input"], row["decisions"]) for row in rows] == [("maps", 20), ("maps", 8), ("phi", 20)]
-    assert "whatever replaces them: none." in markdown(episodes, {"x": rows}, "cosim bench attribution ...")
+    assert "with any replacement: none." in markdown(episodes, {"x": rows}, "cosim bench attribution ...")
 
 
 def test_a_mask_of_another_clock_is_refused() -> None:

@@ -148,7 +148,7 @@ def test_a_worker_that_sees_other_versions_than_the_planner_stops_the_run(
 
     with Store.in_folder(tmp_path) as store:
         batch.begin(plan, store, {})
-        with pytest.raises(BadInput, match=r"versions\..*is another one in a worker"):
+        with pytest.raises(BadInput, match=r"versions\..*has changed in a worker"):
             batch.drive(plan, store, Elsewhere(plan), tmp_path, nothing)
         assert store.rows() == []
 

@@ -58,7 +58,7 @@ def test_a_module_is_no_file() -> None:
     [
         ("mine.py", "name the class or function in it: mine.py:NAME"),
         ("mine.py:", "the name of a class, factory or function is needed"),
-        ("mine.py:a-b", "behind the colon stands a class"),
+        ("mine.py:a-b", "the name of a class, factory"),
         ("my label=runs/old.safetensors", "a label has letters, digits"),
         ("runs/none.safetensors", "no such file: /"),
         ("./none", "no such file: /"),

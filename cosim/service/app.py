@@ -59,7 +59,7 @@ def create(settings: Settings) -> FastAPI:
     uploads = Uploads(settings, processes)
     jobs = Jobs(settings.jobs_url)
     if settings.database is not None:
-        connect(settings.database, TABLES, "--database").dispose()  # rows of runs stand there too
+        connect(settings.database, TABLES, "--database").dispose()  # also for the rows of runs
     clerks = Clerks(settings, processes)
     runs = Runs(settings, jobs, clerks, lambda number: figures.episodes.inc(number))
     warmth = Warmth()
@@ -104,15 +104,15 @@ def create(settings: Settings) -> FastAPI:
         code: {"model": Problem, "description": about}
         for code, about in {
             400: "not a request",
-            401: "no token, or another one",
-            403: "from another origin, or not taken by this server",
+            401: "no token, or a wrong one",
+            403: "from another origin, or not allowed by this server",
             404: "nothing of that id",
             405: "not a method of this path",
-            409: "not in the state that it needs",
+            409: "not possible in the present state",
             413: "too large",
             422: "bad input: field and value are named",
             429: "the server is at its limit",
-            503: "the database does not answer, or another server drives its runs",
+            503: "the database does not answer, or another server drives the runs in it",
             507: "the server's disk is full",
         }.items()
     }
@@ -195,24 +195,24 @@ def _answer_problems(app: FastAPI, settings: Settings) -> None:
 
 
 def _disk(settings: Settings) -> Check:
-    """Whether runs can be kept."""
+    """The check of free disk space for runs."""
 
     def problem() -> str | None:
         free, least = shutil.disk_usage(settings.data).free, settings.limits.free
         if free < least:
-            return f"{free // MB} MB are free where runs are kept, at least {least // MB} are needed"
+            return f"{free // MB} MB are free for runs, at least {least // MB} are needed"
         return None if os.access(settings.data, os.W_OK) else "cannot be written"
 
     return problem
 
 
 def _workers(runs: Runs, warmth: Warmth) -> Check:
-    """Whether runs and sessions can be driven."""
+    """The check of the processes of runs and sessions."""
     return lambda: runs.problem() or warmth.problem()
 
 
 def _about(figures: Figures, ready: Readiness, reads: Lane) -> APIRouter:
-    """The state of the server."""
+    """The routes on the state of the server."""
     router = APIRouter(tags=["server"])
     uploads = not lacking()
 
@@ -221,8 +221,8 @@ def _about(figures: Figures, ready: Readiness, reads: Lane) -> APIRouter:
         return Health(status="ok", version=__version__, uploads=uploads)
 
     @router.get(
-        "/ready", summary="Can the server do its work now? 503 and what is wrong where it cannot",
-        responses={503: {"model": Ready, "description": "a part of it is not there"}},
+        "/ready", summary="Can the server do its work now? 503 with the problems if not",
+        responses={503: {"model": Ready, "description": "a part of the server is not ready"}},
     )  # fmt: skip
     async def is_ready(response: Response) -> Ready:
         problems = await ready.problems()
@@ -234,7 +234,7 @@ def _about(figures: Figures, ready: Readiness, reads: Lane) -> APIRouter:
     def metrics() -> Response:
         return Response(figures.text(), media_type="text/plain; version=0.0.4; charset=utf-8")
 
-    @router.get("/api/catalogue", summary="Worlds, policies and words that a run can name")
+    @router.get("/api/catalogue", summary="Scenarios, policies and option values of runs")
     @reads
     def catalogue() -> Catalogue:
         worlds = [load(name) for name in (*sumo_scenarios.names(), *sumo_scenarios.open_roads())]

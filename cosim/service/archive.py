@@ -14,7 +14,7 @@ from cosim.files.xml_input import GZIP_MAGIC
 from cosim.service.settings import MB, Limits
 
 CHUNK = 1 << 18  # bytes
-LONGEST, DEEPEST = 200, 8  # characters of a name, folders in it
+MAX_NAME, MAX_PARTS = 200, 8  # characters and parts of a name
 _PLAIN = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _ENCRYPTED = 1  # a bit of an entry's flags
 _BROKEN = (
@@ -29,14 +29,14 @@ _BROKEN = (
 
 
 def unpack(archive: Path, folder: Path, suffixes: tuple[str, ...], limits: Limits) -> list[Path]:
-    """Write the files of `archive` below `folder`, which is there and empty; their paths, sorted.
+    """Write the files of `archive` below `folder`, which exists and is empty; returns their sorted paths.
 
-    Only files whose names end with one of `suffixes` are taken. All that they hold is counted together, what
-    gzip files hold too: SUMO and our reader know gzip by its first bytes, not by a name.
+    Names must end with one of `suffixes`. The limit of bytes includes the content of gzip files, which are
+    recognised by their first bytes, as in SUMO.
 
     Raises:
-        BadInput: no zip file; a name that leads elsewhere, is there twice or of another kind; links, devices,
-            encryption; gzip within gzip; more files, more bytes or deeper folders than `limits` say.
+        BadInput: not a zip file; a name outside of the folder, a duplicate name or another suffix; links,
+            devices, encryption; gzip within gzip; more files, bytes or parts of a name than allowed.
     """
     try:
         with zipfile.ZipFile(archive) as found:
@@ -52,44 +52,44 @@ def unpack(archive: Path, folder: Path, suffixes: tuple[str, ...], limits: Limit
             for entry, name in zip(entries, names, strict=True):
                 path = folder / name
                 if path.exists():
-                    raise BadInput("is there twice", field="archive", value=name)
+                    raise BadInput("appears twice", field="archive", value=name)
                 path.parent.mkdir(parents=True, exist_ok=True)
                 with found.open(entry) as source, path.open("xb") as target:
                     for chunk in _counted(source, left, limits):
                         left -= len(chunk)
                         target.write(chunk)
-                for chunk in _held(path, name, left, limits):
+                for chunk in _gzip_content(path, name, left, limits):
                     left -= len(chunk)
                 paths.append(path)
             return sorted(paths)
     except _BROKEN as error:
-        raise BadInput(f"is no zip file that can be read: {error}", field="archive") from None
+        raise BadInput(f"is not a readable zip file: {error}", field="archive") from None
     except OSError as error:
         raise BadInput(f"cannot be unpacked: {error.strerror or error}", field="archive") from None
 
 
 def _name(entry: zipfile.ZipInfo, suffixes: tuple[str, ...]) -> str:
-    """The name of an entry that may be unpacked."""
+    """The checked name of an entry. Raises BadInput for an entry that must not be unpacked."""
     name = entry.filename
     path = PurePosixPath(name)
     mode = entry.external_attr >> 16
     problem = ""
-    if len(name) > LONGEST or len(path.parts) > DEEPEST:
-        problem = f"a name has at most {LONGEST} characters and {DEEPEST} parts"
+    if len(name) > MAX_NAME or len(path.parts) > MAX_PARTS:
+        problem = f"a name has at most {MAX_NAME} characters and {MAX_PARTS} parts"
     elif not name.isprintable() or "\\" in name or ":" in name or "\0" in entry.orig_filename:
-        problem = "a name may not hold this"
+        problem = "a name must not contain this"
     elif path.is_absolute() or ".." in path.parts or str(path) != name or name.startswith("."):
         problem = "a name must lead below the archive's own folder"
     elif stat.S_IFMT(mode) not in (0, stat.S_IFREG):
-        problem = "is no regular file"
+        problem = "is not a regular file"
     elif entry.flag_bits & _ENCRYPTED:
         problem = "is encrypted"
     elif entry.compress_type not in _PLAIN:
-        problem = "is packed otherwise than stored or deflated"
+        problem = "is neither stored nor deflated"
     elif not name.endswith(suffixes):
         problem = f"is not one of {', '.join(suffixes)}"
     if problem:
-        raise BadInput(problem, field="archive", value=name[:LONGEST])
+        raise BadInput(problem, field="archive", value=name[:MAX_NAME])
     return name
 
 
@@ -103,7 +103,7 @@ def _counted(source: IO[bytes] | gzip.GzipFile, most: int, limits: Limits) -> It
         yield chunk
 
 
-def _held(path: Path, name: str, most: int, limits: Limits) -> Iterator[bytes]:
+def _gzip_content(path: Path, name: str, most: int, limits: Limits) -> Iterator[bytes]:
     """The content of a gzip file; empty for another file."""
     with path.open("rb") as raw:
         if raw.read(len(GZIP_MAGIC)) != GZIP_MAGIC:
@@ -112,7 +112,7 @@ def _held(path: Path, name: str, most: int, limits: Limits) -> Iterator[bytes]:
         try:
             with gzip.GzipFile(fileobj=raw) as packed:
                 if packed.peek(len(GZIP_MAGIC)).startswith(GZIP_MAGIC):
-                    raise BadInput("holds a gzip file in a gzip file", field="archive", value=name)
+                    raise BadInput("is a gzip file in a gzip file", field="archive", value=name)
                 yield from _counted(packed, most, limits)
         except (OSError, EOFError, zlib.error) as error:
             raise BadInput(f"broken gzip file: {error}", field="archive", value=name) from None

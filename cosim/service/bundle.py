@@ -1,5 +1,7 @@
-"""Which file of an upload is the one meant, and whether its files refer to one another only: checked before
-anybody follows a name."""
+"""The main file of an upload, and the check that its files refer only to one another.
+
+The check runs before any reference is followed.
+"""
 
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -9,8 +11,8 @@ from cosim.files.xml_input import scan
 from cosim.scenario.sumocfg import FILE_OPTIONS, INPUTS
 from cosim.scenario.vet_demand import OUTPUTS
 
-# Attributes by which SUMO's files name others. Where an element writes, its file is never opened
-# (`cosim.scenario.disabled_outputs`), and the process may write nowhere.
+# Attributes in which SUMO's files name other files. Files of elements that write are never opened
+# (`cosim.scenario.disabled_outputs`).
 REFERENCES = ("file", "href", "imgFile", "decals", "fontFile")
 _SHORT = {"n": "net-file", "net": "net-file", "r": "route-files", "routes": "route-files"}
 _SHORT |= {"a": "additional-files", "additional": "additional-files"}
@@ -27,7 +29,7 @@ def config_of(files: list[Path]) -> Path:
 
 
 def weights_of(files: list[Path]) -> Path:
-    """The weights, their card beside them. Raises BadInput."""
+    """The weights. Raises BadInput unless the files are one weights file and its card."""
     found = [file for file in files if file.suffix == ".safetensors"]
     if len(found) != 1 or files != sorted([found[0], found[0].with_suffix(".json")]):
         raise BadInput("one NAME.safetensors and its card NAME.json are needed, no more", field="archive")
@@ -35,12 +37,12 @@ def weights_of(files: list[Path]) -> Path:
 
 
 def check_references(files: list[Path], folder: Path) -> None:
-    """Raises BadInput: a named file lies elsewhere or is not there; an entity, malformed XML."""
+    """Raises BadInput: a reference to a missing file or out of the folder; an entity, malformed XML."""
     for file in files:
         config = file.suffix == ".sumocfg"
 
         def start(tag: str, attributes: dict[str, str], line: int) -> None:
-            if config:  # noqa: B023 - scanned within this turn
+            if config:  # noqa: B023 - scanned within this iteration
                 name = _SHORT.get(tag, tag)
                 value = attributes.get("value", attributes.get("v", ""))
                 if name in INPUTS or name in FILE_OPTIONS:
@@ -62,7 +64,7 @@ def _check(value: str, file: Path, folder: Path, field: str) -> None:
 
 
 def _inside(value: str, file: Path, folder: Path) -> bool:
-    """Whether the file that `value` names is one of the archive's; links there are none."""
+    """Whether `value` names a file of the archive, which contains no links."""
     if "\0" in value or "${" in value or urlsplit(value).scheme:
         return False
     path = (file.parent / value).resolve()

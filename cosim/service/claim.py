@@ -17,10 +17,10 @@ from cosim.errors import BadInput
 from cosim.service.ids import new_id
 from cosim.service.problems import Refused
 
-LOCK = int.from_bytes(b"cosim")  # PostgreSQL's number of it
-CLAIMING = 5.0  # s until the database notices a killed server
+LOCK = int.from_bytes(b"cosim")  # number of the advisory lock
+CLAIM_TIMEOUT = 5.0  # s until the database notices a killed server
 LOOKS = 1.0  # s between checks of the lock
-STOPPING = 5.0  # s until a server without the lock notices and stops
+STOP_DELAY = 5.0  # s until a server without the lock notices and stops
 
 _claims = sa.Table(
     "cosim_claim",
@@ -37,22 +37,22 @@ class Superseded(Refused):
 
 
 class Claim:
-    """This server's, until `close`. Raises BadInput (`--database`): another server has it."""
+    """This server's claim on the runs, until `close`. Raises BadInput if another server has the claim."""
 
     def __init__(self, engine: sa.Engine, url: str) -> None:
         self._engine, self._name = engine, new_id()
         self._connection: sa.Connection | None = None
         self._term = 0  # number of takeovers from another server
-        self.drives_from = 0.0  # time.monotonic() from which no other server drives any more
+        self.drives_from = 0.0  # time.monotonic(), from which no other server drives
         _claims.create(engine, checkfirst=True)
-        deadline = time.monotonic() + CLAIMING
+        deadline = time.monotonic() + CLAIM_TIMEOUT
         while not self.take():
             if time.monotonic() > deadline:
                 raise BadInput("another server is working in it", field="--database", value=shown(url))
             time.sleep(0.1)
 
     def take(self) -> bool:
-        """Try to take the lock; whether this server has it now. Raises SQLAlchemyError."""
+        """Try to take the lock; returns whether this server has the lock. Raises SQLAlchemyError."""
         connection = self._engine.connect().execution_options(isolation_level="AUTOCOMMIT")
         try:
             if not connection.execute(sa.select(sa.func.pg_try_advisory_lock(LOCK))).scalar_one():
@@ -62,18 +62,18 @@ class Claim:
             if before != self._name:
                 self._note(connection, self._name)
                 self._term += 1
-                self.drives_from = 0.0 if before is None else time.monotonic() + STOPPING
+                self.drives_from = 0.0 if before is None else time.monotonic() + STOP_DELAY
         except BaseException:
-            connection.invalidate()  # and with it the lock
+            connection.invalidate()  # releases the lock
             connection.close()
             raise
         self._connection = connection
         return True
 
     def keep(self) -> bool:
-        """Whether it was this server's without a gap in which another one may have driven.
+        """Whether this server has held the claim without a gap in which another server may have driven.
 
-        A lock that was lost with its connection is taken again.
+        Takes a lock again that was lost with its connection.
         """
         if self._connection is not None:
             with contextlib.suppress(SQLAlchemyError):
@@ -91,10 +91,7 @@ class Claim:
         return self._connection is not None
 
     def check(self, connection: sa.Connection) -> None:
-        """Have the transaction fail unless no other server has claimed the database before its end.
-
-        Raises Superseded.
-        """
+        """Lock the claim until the transaction ends. Raises Superseded if another server has claimed it."""
         if self._noted(connection) != self._name:
             raise Superseded("another server drives the runs of this database")
 

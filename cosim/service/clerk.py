@@ -26,9 +26,9 @@ CLERKS = 2
 
 
 class Clerk(Planner):
-    """Hosted in a process whose working folder is that of the runs; the reports are imported when needed.
+    """Hosted in an unconfined process, which reads no uploads; the working folder is the folder of runs.
 
-    It is not confined: it reads no upload.
+    The code of reports is imported when needed.
     """
 
     def __init__(self, runs: str, database: str | None, limits: Limits) -> None:
@@ -37,7 +37,7 @@ class Clerk(Planner):
         self._database = database
 
     def asked(self, flags: Mapping[str, Any]) -> tuple[list[EpisodeOptions], range]:
-        """What a request names: the case of every cell and the seeds, no file read. Raises BadInput."""
+        """The case of every cell of a request, and its seeds; reads no file. Raises BadInput."""
         wanted = spec.read(None, flags)
         seeds = range(*wanted.seeds)
         if (cells := wanted.episodes // len(seeds)) > self._limits.cells:
@@ -70,7 +70,7 @@ class Clerk(Planner):
         return found.case, found.manifest, found.trace_hash
 
     def compare(self, a: str, b: str, fail_on: Sequence[str], across: Sequence[str]) -> dict[str, Any]:
-        """What `cosim compare --json` prints; `a`, `b`: RUN or RUN:POLICY."""
+        """The document of `cosim compare --json`; `a`, `b`: RUN or RUN:POLICY."""
         from cosim.report import verdict
         from cosim.report.compare import compare
         from cosim.report.pairing import side
@@ -81,9 +81,9 @@ class Clerk(Planner):
 class Clerks:
     """Processes that each host a `Clerk`; callers wait for a free one.
 
-    An upload is read by a confined process in place of a clerk, which is not reused.
+    Uploads are read by a new confined process instead of a clerk.
 
-    Raises BadInput: what was asked for takes longer than `limits.check` s, or what the method raises.
+    Raises BadInput: the call takes longer than `limits.check` s, or the method raises it.
     """
 
     def __init__(self, settings: Settings, processes: Processes) -> None:
@@ -96,7 +96,7 @@ class Clerks:
             self._free.put(k)
 
     def plan(self, flags: Mapping[str, Any], uploads: Sequence[str]) -> Plan:
-        """The plan of a new run, of the request's flags and the uploads that it names."""
+        """The plan of a new run from the request's flags and its uploads."""
         cases, seeds = self.call("asked", flags)
         return self._planned("plan", cases, seeds, uploads)
 
@@ -111,7 +111,7 @@ class Clerks:
         return scenario, case
 
     def call(self, method: str, *arguments: Any) -> Any:
-        """One method of a `Clerk`, on what is no upload."""
+        """Call one method of a `Clerk`, without uploads."""
         k = self._free.get()
         try:
             worker = self._workers[k]
@@ -125,7 +125,7 @@ class Clerks:
             self._free.put(k)
 
     def close(self) -> None:
-        """End the processes; calls that wait for them raise SimulationCrashed."""
+        """End the processes; calls in progress raise SimulationCrashed."""
         for worker in filter(None, self._workers):
             worker.kill()
         for _ in self._workers:
@@ -144,7 +144,7 @@ class Clerks:
         return Plan(tuple(replace(cell, case=case) for cell, case in cells), seeds)
 
     def _read(self, uploads: Sequence[str], method: str, *arguments: Any) -> Any:
-        """One method of a `Planner`, confined where there are uploads."""
+        """Call one method of a `Planner`, in a confined process if there are uploads."""
         if not uploads:
             return self.call(method, *arguments)
         k = self._free.get()  # at most one call per clerk
@@ -160,4 +160,4 @@ class Clerks:
             self._free.put(k)
 
     def _late(self) -> BadInput:
-        return BadInput(f"takes more than {self._limit:g} s to work out")
+        return BadInput(f"takes more than {self._limit:g} s to check")

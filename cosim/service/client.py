@@ -7,8 +7,8 @@
         while not session.over:
             views = session.act({av: my_agent(seen) for av, seen in views.items()}).observations
 
-`client.resume` goes on with a run that failed. Needs nothing but cosim itself; the token, where the server
-asks for one, is `token` or COSIM_TOKEN.
+`client.resume` continues a failed run. The client needs only cosim itself. If the server requires a token,
+pass `token` or set COSIM_TOKEN.
 """
 
 from __future__ import annotations
@@ -50,14 +50,14 @@ def open(
     seed: int | None = None,
     **words: Any,
 ) -> Session:
-    """Open a session on the server at `url`; `what` is a world's name, or `upload:ID`.
+    """Open a session on the server at `url`; `what` is a scenario's name, or `upload:ID`.
 
-    `words` are those of `cosim.open` that are text or numbers (`demand`, `behavior`, `svo`, ...), and
-    `idle_s`, after which the session ends by itself. `others` names the policy of the AVs that you do not
+    `words` are the options of `cosim.open` that are text or numbers (`demand`, `behavior`, `svo`, ...), and
+    `idle_s`, the idle time after which the session ends. `others` names the policy of the AVs that you do not
     command. `observation`: the compact size, with or without maps. `timeout`: s to wait for an answer.
 
     Raises:
-        BadInput: what the server refuses, field and value named; no server answers.
+        BadInput: the server refuses field and value; no server answers.
     """
     maps = observation.maps
     if observation != replace(COMPACT, maps=maps):
@@ -68,7 +68,7 @@ def open(
 
 
 def resume(url: str, run: str, *, token: str | None = None, timeout: float = TIMEOUT) -> dict[str, Any]:
-    """Have the server at `url` go on with a run that failed or was cancelled; the run's document.
+    """Have the server at `url` continue a failed or cancelled run; returns the run's document.
 
     Raises BadInput: no such run, or it is not in that state; no server answers.
     """
@@ -79,7 +79,7 @@ def resume(url: str, run: str, *, token: str | None = None, timeout: float = TIM
 
 
 class Remote(Session):
-    """A session on a server. `scenario` of an upload knows names and times; its files are elsewhere."""
+    """A session on a server. The `scenario` of an upload has names and times, but no local files."""
 
     def __init__(self, connection: Connection, request: Mapping[str, Any]) -> None:
         caller = _Caller(connection, request)
@@ -101,7 +101,7 @@ class Connection:
     def __init__(self, url: str, token: str | None, timeout: float) -> None:
         parts = urlsplit(url)
         if parts.scheme not in ("http", "https") or not parts.hostname:
-            raise BadInput("is no http://HOST:PORT", field="url", value=url)
+            raise BadInput("http://HOST:PORT is needed", field="url", value=url)
         kind = http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
         self._used = 0.0
         self._url, self._base = url, parts.path.rstrip("/")
@@ -111,10 +111,10 @@ class Connection:
             self._headers["Authorization"] = f"Bearer {token}"
 
     def request(self, method: str, path: str, document: object = None) -> tuple[str, bytes]:
-        """Kind and body of the answer.
+        """Media type and body of the answer.
 
-        Raises BadInput: what the server refuses. SimulationError: the simulation failed. CosimError: the
-        server is gone, or failed.
+        Raises BadInput: the server refuses the request. SimulationError: the simulation failed. CosimError:
+        the server is gone, or failed.
         """
         body = None if document is None else json.dumps(document)
         connection = self._connection
@@ -143,7 +143,7 @@ class Connection:
 
 
 class _Caller:
-    """The session's `Caller`: requests to the server in place of a worker."""
+    """The session's `Caller`: sends requests to the server instead of a worker."""
 
     def __init__(self, connection: Connection, request: Mapping[str, Any]) -> None:
         self._connection = connection
@@ -153,11 +153,11 @@ class _Caller:
     def call(self, method: str, *arguments: Any) -> Any:
         """One method of `cosim.envs.host.SessionHost`."""
         if not hasattr(self, f"_{method}"):
-            raise BadInput("a server does not tell it", field=method)
+            raise BadInput("is not available on a server", field=method)
         return getattr(self, f"_{method}")(*arguments)
 
     def close(self) -> None:
-        """Close the session, where the server still has it."""
+        """Close the session, if the server still has it."""
         with contextlib.suppress(CosimError):
             self._connection.request("DELETE", self._path)
         self._connection.close()

@@ -1,11 +1,11 @@
-"""What runs uploads: a process that reads its upload and our code, writes its own folder, and has limits.
+"""Confined processes for uploads: they read only uploads and cosim's code, and write only their own folder.
 
-Landlock says which files it sees, seccomp which system calls it makes (no sockets, programs, processes), its
-resources are limited, and root is not root in it. It is started without the server's environment, and what it
-answers is read as plain data (`cosim.workers.untrusted`).
+Landlock restricts files, seccomp restricts system calls (no sockets, programs, processes), resources are
+limited, and root loses its privileges. A confined process starts without the server's environment. Its
+answers are read as plain data (`cosim.workers.untrusted`).
 
-Nothing of the simulation is imported before the process is confined: numba settles on its cache when it is
-imported, and gets its own copy, which no other process reads.
+The simulation is imported after the process is confined, because numba chooses its cache at import. The
+cache is a private copy, which no other process reads.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Room:
     limits: Limits = Limits()
 
     def enter(self) -> None:
-        """Confine this process, for good. Raises CosimError where `lacking` says something."""
+        """Confine this process permanently. Raises CosimError if `lacking` gives a reason."""
         if problem := lacking():
             raise CosimError(problem)
         os.dup2(2, 1)  # stdout belongs to the server
@@ -96,15 +96,15 @@ def lacking() -> str:
     if not landlock.version():
         return "this kernel has no Landlock to confine uploads"
     if not seccomp.available():
-        return "this kernel has no seccomp to confine uploads, or is none of x86_64 and aarch64"
-    return "" if privileges.droppable() else "root may not become an ordinary user here to confine uploads"
+        return "this kernel has no seccomp to confine uploads, or is neither x86_64 nor aarch64"
+    return "" if privileges.droppable() else "root cannot become an ordinary user here to confine uploads"
 
 
 @contextlib.contextmanager
 def room(settings: Settings, uploads: Sequence[str | Path], *writes: Path) -> Iterator[Room | None]:
-    """The room of what uses these uploads (ids, or a file); None without uploads.
+    """The room for processes that use these uploads (ids, or a file); None without uploads.
 
-    Its scratch folder is removed afterwards. Raises BadInput when too much was written in it.
+    The scratch folder is removed afterwards. Raises BadInput if too much was written into it.
     """
     if not uploads:
         yield None
@@ -119,7 +119,7 @@ def room(settings: Settings, uploads: Sequence[str | Path], *writes: Path) -> It
 
 
 def limit_resources(limits: Limits) -> None:
-    """What this process may use from now on, processor time apart."""
+    """Limit this process's memory, files and descriptors; for processor time see `allow_processor_time`."""
     for limit, most in (
         (resource.RLIMIT_AS, limits.memory),
         (resource.RLIMIT_FSIZE, limits.file),
@@ -136,7 +136,7 @@ def _limit(limit: int, most: int) -> None:
 
 
 def allow_processor_time(seconds: float) -> None:
-    """So many s more of it; then the kernel ends the process (SIGXCPU)."""
+    """Allow `seconds` more of processor time; then the kernel ends the process (SIGXCPU)."""
     used = resource.getrusage(resource.RUSAGE_SELF)
     soft = int(used.ru_utime + used.ru_stime + seconds) + 1
     resource.setrlimit(resource.RLIMIT_CPU, (soft, resource.getrlimit(resource.RLIMIT_CPU)[1]))
@@ -168,7 +168,7 @@ class ConfinedRunner:
 
 @untrusted
 class Drawer:
-    """Drives an episode again and draws it; confined in a room, and within the limits without one too."""
+    """Drives an episode again and draws it: confined in a room, or only within the limits."""
 
     def __init__(self, room: Room | None, limits: Limits) -> None:
         if room is None:
@@ -214,7 +214,7 @@ class Examiner:
         allow_processor_time(room.limits.check)
 
     def take(self, archive: str, folder: str, kind: str) -> tuple[str, dict[str, Any]]:
-        """Unpack an archive into `folder`: the name of its .sumocfg or weights there, and what it holds.
+        """Unpack an archive into `folder`; returns the name of its .sumocfg or weights, and a description.
 
         Raises BadInput.
         """
@@ -239,7 +239,7 @@ class Examiner:
         scenario = load(config)
         report = vet(scenario)
         with _memory_is_limited():
-            sumo(scenario, {}, 1).close()  # a net that kills SUMO kills it here
+            sumo(scenario, {}, 1).close()  # a net that crashes SUMO does it here
         return {
             "edges": report.edges,
             "vehicles": report.vehicles,
@@ -250,7 +250,7 @@ class Examiner:
         }
 
     def policy(self, weights: str) -> dict[str, Any]:
-        """The agent of the weights. Raises BadInput if they do not fit their card."""
+        """The agent of the weights. Raises BadInput if weights and card do not match."""
         from cosim.policies import make
 
         with _memory_is_limited():
@@ -275,7 +275,7 @@ def session_host(
     reward: str,
     others: PolicyFactory | None,
 ) -> WatchedHost:
-    """Runs in a session's process: the simulation is imported there, not here."""
+    """The host of a session. Call it in the session's process, since it imports the simulation."""
     from cosim.rewards import read
     from cosim.service.watch import WatchedHost
 
@@ -286,27 +286,32 @@ def session_host(
 def confined_host(room: Room, *arguments: Any) -> WatchedHost:
     """The host of a session in a confined process; `arguments` are those of `session_host`."""
     room.enter()
-    allow_processor_time(room.limits.cpu)
+    return timed_host(room.limits.cpu, *arguments)
+
+
+def timed_host(seconds: float, *arguments: Any) -> WatchedHost:
+    """The host of a session with `seconds` of processor time per episode; `arguments` as `session_host`."""
+    allow_processor_time(seconds)
     host = session_host(*arguments)
     begin = host.reset
 
     def reset(seed: int) -> Reply:
-        allow_processor_time(room.limits.cpu)
+        allow_processor_time(seconds)
         return begin(seed)
 
-    setattr(host, "reset", reset)  # noqa: B010 - what the worker calls
+    setattr(host, "reset", reset)  # noqa: B010 - the worker calls this attribute
     return host
 
 
 class _memory_is_limited:
-    """Turn a MemoryError of the block into a fault of the upload."""
+    """Turn a MemoryError of the block into a BadInput."""
 
     def __enter__(self) -> None:
         pass
 
     def __exit__(self, kind: object, error: object, _: object) -> None:
         if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
-            raise BadInput("needs more memory than an upload is given") from None
+            raise BadInput("needs more memory than an upload may use") from None
 
 
 def _folder(package: str) -> Path:
@@ -326,7 +331,7 @@ def _own_numba_cache(target: Path, packages: Iterable[Path]) -> None:
         return
     for package in packages:
         for kernel in package.rglob("__pycache__/*.nb[ic]"):
-            source = str(kernel.parents[1])  # the folder's name in a given cache is numba's own:
+            source = str(kernel.parents[1])  # numba's name for the folder in a given cache:
             name = f"{kernel.parents[1].name}_{hashlib.sha1(source.encode()).hexdigest()}"
             (target / name).mkdir(parents=True, exist_ok=True)
             shutil.copyfile(kernel, target / name / kernel.name)

@@ -1,4 +1,4 @@
-"""Disk limits of confined processes: a process that exceeds its room's limit is killed."""
+"""Disk limits of confined processes: processes of a room above its limit are killed."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ def folder_prefix() -> str:
 
 @contextlib.contextmanager
 def limited(scratch: Path, writes: Sequence[Path], limits: Limits) -> Iterator[None]:
-    """During the block those processes are ended that have a folder in `scratch`, when there is more than
-    `limits.disk` in it and new in `writes`, or less than `limits.free` is free.
+    """During the block, kill processes with a folder in `scratch` when the disk limits are exceeded.
 
-    Raises BadInput when that was so.
+    Limits: `limits.disk` for the content of `scratch` and new content of `writes`; `limits.free` for free
+    space. Raises BadInput if a limit was exceeded.
     """
     before = sum(map(_used, writes))
     ended = threading.Event()
@@ -57,7 +57,7 @@ def limited(scratch: Path, writes: Sequence[Path], limits: Limits) -> Iterator[N
 
 
 def _used(folder: Path) -> int:
-    """Bytes on the disk, links not followed."""
+    """Bytes on the disk below `folder`; links are not followed."""
     total = 0
     for path, _, names in os.walk(folder):
         for name in names:
@@ -68,7 +68,7 @@ def _used(folder: Path) -> int:
 
 
 def _end_all(scratch: Path) -> None:
-    """Kill the processes with a folder there; reused process ids are recognised by their start time."""
+    """Kill the processes with a folder in `scratch`; the start time recognises reused process ids."""
     for folder in scratch.iterdir():
         pid, began, _ = folder.name.split("-", 2)
         with contextlib.suppress(OSError):
@@ -77,5 +77,5 @@ def _end_all(scratch: Path) -> None:
 
 
 def _began(pid: int) -> str:
-    """When a process began, in ticks of the system's clock."""
+    """Start time of a process, in ticks of the system's clock."""
     return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[_BEGAN]

@@ -6,7 +6,7 @@ from pydantic import BaseModel, Field
 
 
 class Problem(BaseModel):
-    """Why a request is not carried out: one sentence, and what it is about."""
+    """Why a request is not carried out: one sentence, with field, value and file."""
 
     problem: str = Field(examples=["no such scenario, did you mean 'merge'?"])
     field: str | None = Field(None, examples=["scenario"])
@@ -19,7 +19,7 @@ class Health(BaseModel):
 
     status: str = Field("ok", examples=["ok"])
     version: str
-    uploads: bool = Field(description="whether uploads can be confined here (Landlock), so are taken")
+    uploads: bool = Field(description="whether uploads are accepted: they can be confined here (Landlock)")
 
 
 class Ready(BaseModel):
@@ -32,7 +32,7 @@ class Ready(BaseModel):
 
 
 class World(BaseModel):
-    """A world that ships."""
+    """A shipped scenario."""
 
     name: str
     title: str
@@ -41,7 +41,7 @@ class World(BaseModel):
 
 
 class Catalogue(BaseModel):
-    """What a run can be made of."""
+    """Possible values of a run's options."""
 
     scenarios: list[World]
     policies: list[str]
@@ -61,7 +61,7 @@ class Progressing(BaseModel):
 
 
 class RunDocument(BaseModel):
-    """A run and how far it is."""
+    """A run and its progress."""
 
     id: str = Field(examples=["3f2a9c10b7de"])
     name: str
@@ -73,7 +73,7 @@ class RunDocument(BaseModel):
     began: str | None
     ended: str | None
     error: str | None
-    waiting: int | None = Field(description="how many runs wait before it")
+    waiting: int | None = Field(description="number of runs ahead in the queue")
     seconds_left: float | None = Field(description="at the rate so far")
     running: list[Progressing]
 
@@ -86,12 +86,12 @@ class RunList(BaseModel):
 
 
 class Estimate(BaseModel):
-    """How long a run would take."""
+    """The estimated time of a run."""
 
     cells: int
     episodes: int
-    estimated_s: float | None = Field(description="on a server that does nothing else; null: not known")
-    basis: str = Field(description="what it rests on")
+    estimated_s: float | None = Field(description="on an otherwise idle server; null: unknown")
+    basis: str = Field(description="basis of the estimate")
 
 
 class Rows(BaseModel):

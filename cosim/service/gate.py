@@ -23,9 +23,9 @@ Send = Callable[[Message], Awaitable[None]]
 App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 PROBES = ("/health", "/ready")
-OPEN = (*PROBES, "/login")  # need no token
-PARTS = "/page/"  # static parts of the page, without user data: no token either
-PAGES = ("/", "/runs")  # where a browser without a token is sent to the form
+OPEN = (*PROBES, "/login")  # paths that need no token
+PARTS = "/page/"  # static parts of the page without user data, which need no token
+PAGES = ("/", "/runs")  # a browser without a token is redirected from here to the login form
 COOKIE = "cosim"
 UPLOADS = "/api/uploads"
 HEADERS = (
@@ -38,8 +38,11 @@ log = logging.getLogger("cosim.service.http")
 
 
 class Gate:
-    """ASGI middleware. A browser is served from the server's own origin only; without a token, under this
-    machine's own names only, so that no page elsewhere reaches the server through somebody's browser."""
+    """ASGI middleware that checks every request.
+
+    Requests from other origins are refused. Without a token, requests must use a loopback name of this
+    machine, so that foreign pages cannot reach the server through a user's browser.
+    """
 
     def __init__(self, app: App, settings: Settings, figures: Figures) -> None:
         self._app, self._settings, self._figures = app, settings, figures
@@ -66,8 +69,8 @@ class Gate:
         except Exception:
             if status or scope["type"] != "http":
                 raise
-            log.exception("a fault of the server's own", extra={"path": scope["path"]})
-            await _refuse(scope, answered, 500, "a fault of the server's own: its log has more")
+            log.exception("internal error", extra={"path": scope["path"]})
+            await _refuse(scope, answered, 500, "internal error: the server's log has more")
         finally:
             self._note(scope, status, time.perf_counter() - began)
 
@@ -92,7 +95,9 @@ class Gate:
             except ValueError:
                 length = -1
             if not 0 <= length <= most:
-                problem = f"at most {most} bytes are taken" if length > 0 else "content-length: no number"
+                problem = (
+                    f"at most {most} bytes are accepted" if length > 0 else "content-length: not a number"
+                )
                 await _refuse(scope, answered, 413 if length > 0 else 400, problem)
             else:
                 await self._app(scope, _limited(receive, most), answered)
@@ -109,7 +114,7 @@ class Gate:
             except ValueError:
                 name = ""
             if not is_loopback(name):
-                return 403, "without a token the server is asked by this machine's own names only"
+                return 403, "without a token the server answers only to loopback names of this machine"
         elif scope["path"] not in OPEN and not scope["path"].startswith(PARTS):
             scheme, _, given = headers.get(b"authorization", b"").partition(b" ")
             bearer = scheme.lower() == b"bearer" and hmac.compare_digest(given.strip(), self._token)
@@ -118,7 +123,7 @@ class Gate:
         return None
 
     def _knows(self, cookies: bytes) -> bool:
-        """Whether one of them is what the form gave for the token."""
+        """Whether one of the cookies is the login form's cookie for the token."""
         assert self._cookie is not None
         given = (part.strip().partition(b"=") for part in cookies.split(b";"))
         return any(
@@ -130,7 +135,7 @@ class Gate:
         return limits.upload if path.startswith(UPLOADS) else limits.body
 
     def _note(self, scope: Scope, status: int, seconds: float) -> None:
-        route = getattr(scope.get("route"), "path", "none")  # the pattern: an id makes no figure of its own
+        route = getattr(scope.get("route"), "path", "none")  # the pattern, so that ids do not create figures
         method = scope.get("method", "WEBSOCKET")
         known = method if method in ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS") else "other"
         self._figures.requests.labels(known, route, str(status)).inc()
@@ -146,7 +151,7 @@ class Gate:
 
 
 def cookie_of(token: str) -> str:
-    """The cookie in place of the token: valid for this server only, and without the token itself."""
+    """The cookie that a browser sends instead of the token; it does not reveal the token."""
     return hmac.new(token.encode(), b"cosim page", "sha256").hexdigest()
 
 
@@ -158,7 +163,7 @@ def _netloc(origin: str) -> str | None:
 
 
 def _limited(receive: Receive, most: int) -> Receive:
-    """`receive`, which raises HTTPException behind `most` bytes (413), after `PAUSE` s without any (408)."""
+    """`receive` with limits: HTTPException 413 after `most` bytes, 408 after `PAUSE` s without data."""
     got, whole = 0, False
 
     async def limited() -> Message:
@@ -166,11 +171,11 @@ def _limited(receive: Receive, most: int) -> Receive:
         try:
             message = await asyncio.wait_for(receive(), None if whole else PAUSE)
         except TimeoutError:
-            raise HTTPException(408, f"nothing of the request came for {PAUSE:g} s") from None
+            raise HTTPException(408, f"no data of the request for {PAUSE:g} s") from None
         whole = not message.get("more_body", False)
         got += len(message.get("body", b""))
         if got > most:
-            raise HTTPException(413, f"at most {most} bytes are taken")
+            raise HTTPException(413, f"at most {most} bytes are accepted")
         return message
 
     return limited

@@ -46,8 +46,8 @@ _jobs = sa.Table(
 class Job:
     """One run as the list has it; times are UTC, ISO 8601."""
 
-    number: int  # the order in which they came
-    run: str  # its id
+    number: int  # in the order of submission
+    run: str  # id
     name: str
     status: str  # one of STATUSES
     request: dict[str, Any]
@@ -61,10 +61,10 @@ class Job:
 
 
 class Jobs:
-    """The list. Raises BadInput (`--database`): its database cannot be reached, or another server has it.
+    """The list. Raises BadInput (`--database`): the database cannot be reached, or another server has it.
 
-    PostgreSQL is claimed until `close` (`claim`); SQLite lies in a locked folder. What writes raises
-    Superseded where another server has claimed it since.
+    A PostgreSQL database is claimed until `close` (`claim`); SQLite is in a locked folder. Writing methods
+    raise Superseded if another server has claimed the database.
     """
 
     def __init__(self, url: str) -> None:
@@ -127,7 +127,7 @@ class Jobs:
     def problem(self) -> str | None:
         """The reason why this server cannot drive its runs now; None if it can. Raises SQLAlchemyError."""
         self.counts()
-        return None if self.claim is None or self.claim.held else "another server drives its runs, or may"
+        return None if self.claim is None or self.claim.held else "another server may drive its runs"
 
     def close(self) -> None:
         """Close the database connection."""
@@ -148,5 +148,5 @@ class Jobs:
 
 
 def now() -> str:
-    """The present, UTC, in s."""
+    """The present time in UTC, ISO 8601 with seconds."""
     return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")

@@ -1,7 +1,7 @@
-"""Linux's Landlock: this process sees no files but those it is given, starts none of them, and has no TCP.
+"""Linux's Landlock: restricts a process to given files, without starting programs and without TCP.
 
-Needs no privilege (https://docs.kernel.org/userspace-api/landlock.html, system call numbers of every Linux
-architecture but alpha). What was open before stays open.
+Needs no privilege (https://docs.kernel.org/userspace-api/landlock.html; the system call numbers hold on every
+Linux architecture except alpha). Files that were open before stay open.
 """
 
 import ctypes
@@ -44,18 +44,18 @@ class _PathBeneath(ctypes.Structure):
 
 
 def version() -> int:
-    """Landlock's version on this kernel; 0: there is none."""
+    """Landlock's version on this kernel; 0: no Landlock."""
     if sys.platform != "linux":
         return 0
     return max(int(ctypes.CDLL(None).syscall(_CREATE, None, ctypes.c_size_t(0), _VERSION)), 0)
 
 
 def restrict(reads: Iterable[Path], writes: Iterable[Path], lists: Iterable[Path] = ()) -> None:
-    """From now on this process may only read below `reads`, read and write below `writes`, and see the names
-    of what is below `lists`. It starts no program.
+    """From now on this process may only read below `reads`, read and write below `writes`, and list folders
+    below `lists`. It cannot start programs.
 
-    TCP is shut as well where the kernel can (version 4), signals to others too (6). Raises CosimError without
-    Landlock, and in a process of several threads: it holds for the thread that asks.
+    TCP is blocked if the kernel supports that (version 4), and so are signals to other processes (6). Raises
+    CosimError without Landlock, and with several threads, since only the calling thread would be restricted.
     """
     abi = version()
     if not abi:
@@ -72,7 +72,7 @@ def restrict(reads: Iterable[Path], writes: Iterable[Path], lists: Iterable[Path
         return result
 
     ruleset = _Ruleset(every, (abi >= 4) * _TCP, (abi >= 6) * _SCOPE)
-    size = 8 if abi < 4 else 16 if abi < 6 else 24  # what the kernel knows of it
+    size = 8 if abi < 4 else 16 if abi < 6 else 24  # bytes of the structure in this version
     rules = call(_CREATE, ctypes.byref(ruleset), ctypes.c_size_t(size), 0)
     try:
         rights = (reads, _READ), (writes, _WRITE), (lists, _READ_DIR)

@@ -20,9 +20,9 @@ T = TypeVar("T")
 
 
 class Lane:
-    """`threads` pieces of work at once and `waiting` more. Decorates a route that blocks.
+    """A queue for blocking routes, used as a decorator: `threads` at once, and `waiting` more.
 
-    `work` names it to users. Raises Unavailable (429) when full.
+    `work` names the kind of work in messages. Raises Unavailable (429) when full.
     """
 
     def __init__(self, work: str, threads: int, waiting: int) -> None:
@@ -31,7 +31,7 @@ class Lane:
         self._free = threading.BoundedSemaphore(self._most)
 
     def __call__(self, route: Callable[P, T]) -> Callable[P, Awaitable[T]]:
-        """The route, off the server's loop."""
+        """The route, run on a thread outside of the server's event loop."""
 
         @functools.wraps(route)
         async def queued(*arguments: P.args, **named: P.kwargs) -> T:
@@ -40,25 +40,25 @@ class Lane:
         return queued
 
     async def run(self, work: Callable[[], T]) -> T:
-        """What `work` returns or raises."""
+        """Run `work` on a thread; returns or raises what `work` does."""
         return await asyncio.wrap_future(self.begin(work))
 
     def begin(self, work: Callable[[], T]) -> Future[T]:
-        """What `work` will return or raise."""
+        """The future of `work` on a thread. Raises Unavailable when the queue is full."""
         if not self._free.acquire(blocking=False):
-            raise Unavailable(f"{self._most} {self._work} are asked for already: try again later")
+            raise Unavailable(f"{self._most} {self._work} are requested already: try again later")
         future = self._threads.submit(work)
-        # Not when its client goes away: the thread is still taken.
+        # A client's disconnect does not free the thread.
         future.add_done_callback(lambda _: self._free.release())
         return future
 
     def close(self) -> None:
-        """What waits is not begun."""
+        """Drop waiting work."""
         self._threads.shutdown(wait=False, cancel_futures=True)
 
 
 class Lanes:
-    """Those of a server."""
+    """The queues of a server, by kind of work."""
 
     def __init__(self, limits: Limits) -> None:
         self.reads = Lane("answers", 16, 8 * limits.waiting)
@@ -70,6 +70,6 @@ class Lanes:
         self.sessions = Lane("sessions' answers", (CALLS + 1) * limits.sessions, limits.waiting)
 
     def close(self) -> None:
-        """What waits is not begun."""
+        """Drop waiting work."""
         for lane in vars(self).values():
             lane.close()

@@ -1,4 +1,4 @@
-"""Hosts of shipped scenarios: not confined, but with the limits of uploads."""
+"""Hosts of shipped scenarios: not confined, but with the resource limits of uploads."""
 
 from __future__ import annotations
 
@@ -6,12 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 from cosim.batch.episode_runner import EpisodeRunner
 from cosim.scenario.options import EpisodeOptions
-from cosim.service.confined import allow_processor_time, limit_resources, session_host
+from cosim.service.confined import allow_processor_time, limit_resources, timed_host
 from cosim.service.settings import Limits
 from cosim.workers.tasks import Progress
 
 if TYPE_CHECKING:
-    from cosim.envs.host import Reply
     from cosim.service.watch import WatchedHost
 
 
@@ -34,13 +33,4 @@ class LimitedRunner(EpisodeRunner):
 def limited_host(limits: Limits, *arguments: Any) -> WatchedHost:
     """The host of a session within `limits`; `arguments` are those of `session_host`."""
     limit_resources(limits)
-    allow_processor_time(limits.cpu)
-    host = session_host(*arguments)
-    begin = host.reset
-
-    def reset(seed: int) -> Reply:
-        allow_processor_time(limits.cpu)
-        return begin(seed)
-
-    setattr(host, "reset", reset)  # noqa: B010 - what the worker calls
-    return host
+    return timed_host(limits.cpu, *arguments)

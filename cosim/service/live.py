@@ -1,8 +1,8 @@
 """Viewers of a session, their messages, and driving on request of their pages.
 
-A page requests driving up to some moment, and requests more as its own clock approaches that moment. A page
-that pauses, is slow or gone therefore drives nothing. Other drivers of the session never wait: for a slow
-page the oldest unsent steps are dropped.
+A page requests driving up to some time, and requests more as its own clock approaches that time. So a page
+that pauses, is slow or is gone drives nothing. Programs that drive the session never wait: for a slow page
+the oldest unsent steps are dropped.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ WATCHED = 16  # pages per session
 
 
 class Stage(Protocol):
-    """The watched session; each method waits for its turn, and raises CosimError."""
+    """The watched session. Each method waits until the session is free, and raises CosimError."""
 
     def scene(self) -> Scene | None: ...  # None: no episode has begun
 
@@ -51,7 +51,7 @@ class Viewer:
         self._knows_road = False
 
     def take(self) -> list[str]:
-        """Messages."""
+        """The waiting messages, as JSON."""
         with self._lock:
             found, self._said = self._said, []
             steps, length = [*self._steps], len(self._lasting)
@@ -78,7 +78,7 @@ class Viewer:
         self._call()
 
     def add(self, step: str) -> None:
-        """One decision."""
+        """Add the step of one decision."""
         with self._lock:
             if len(self._steps) >= KEPT:
                 self._steps.popleft()
@@ -87,7 +87,7 @@ class Viewer:
         self._call()
 
     def say(self, message: str, *, end: bool = False) -> None:
-        """Something else, as JSON; the last thing with `end`."""
+        """Add another message, as JSON; with `end` the last one."""
         with self._lock:
             self._said.append(message)
             self.ended |= end
@@ -103,8 +103,8 @@ class Viewer:
 class Live:
     """The viewers of one session.
 
-    `drive(s)` carries out one decision unless the episode is over or that far; `reset(seed)` begins another;
-    `explain(av)` has this AV's choices explained.
+    `drive(s)` carries out one decision and returns True, unless the episode is over or has reached `s`;
+    `reset(seed)` begins another episode; `explain(av)` selects the AV for attribution.
     """
 
     def __init__(
@@ -120,10 +120,10 @@ class Live:
         self._scene: Scene | None = None
         self._lasting: list[str] = []
         self._step = ""  # the newest
-        self._begin: list[int | None] = []  # seeds that were asked for
-        self._explained: list[str | None] = []  # AVs that were asked for
+        self._begin: list[int | None] = []  # requested seeds
+        self._explained: list[str | None] = []  # AVs requested for attribution
         self._driver: threading.Thread | None = None
-        self.program = False  # whether requests drive it
+        self.program = False  # whether a program drives the session by requests
 
     @property
     def number(self) -> int:
@@ -133,7 +133,7 @@ class Live:
     # ---- in the session's turn ----
 
     def told(self, begun: bool) -> None:
-        """A decision was carried out, or an episode has begun."""
+        """Tell the viewers that a decision was carried out, or that an episode has begun."""
         if not self._viewers:
             if self._scene is not None:
                 self._scene = None
@@ -149,7 +149,7 @@ class Live:
     def join(self, viewer: Viewer) -> None:
         """Add a viewer. Raises Conflict at the limit."""
         if len(self._viewers) >= WATCHED:
-            raise Conflict(f"{WATCHED} pages watch it already")
+            raise Conflict(f"{WATCHED} pages watch this session already")
         self._viewers.append(viewer)
         if self._scene is None:
             self._look()
@@ -172,7 +172,7 @@ class Live:
             self._go()
 
     def ask_begin(self, seed: int | None) -> None:
-        """Begin the episode `seed`; None: the one after the last."""
+        """Begin the episode of `seed`; None: the next seed."""
         with self._changed:
             self._begin.append(seed)
             for viewer in self._viewers:

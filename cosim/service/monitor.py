@@ -20,7 +20,7 @@ from prometheus_client import (
 )
 from prometheus_client.core import GaugeMetricFamily, Metric
 
-_OWN = frozenset(vars(logging.makeLogRecord({})))  # fields that every record has
+_STANDARD = frozenset(vars(logging.makeLogRecord({})))  # fields of every record
 log = logging.getLogger("cosim.service")
 STEP_BUCKETS = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # s
 
@@ -46,7 +46,7 @@ class Figures:
         )
 
     def text(self) -> bytes:
-        """All of them, as Prometheus reads them."""
+        """All figures in Prometheus' text format."""
         return bytes(generate_latest(self._registry))
 
 
@@ -57,7 +57,7 @@ class _States:
         self._states = states
 
     def describe(self) -> Iterable[Metric]:
-        """Nothing before it is asked for."""
+        """No descriptions: gauges are computed on request."""
         return ()
 
     def collect(self) -> Iterable[Metric]:
@@ -66,8 +66,8 @@ class _States:
             family = GaugeMetricFamily(name, about, labels=[label])
             try:
                 now = values()
-            except Exception as error:  # the database is gone: the other figures are wanted most then
-                log.warning("a figure is not known", extra={"figure": name, "error": str(error)})
+            except Exception as error:  # without the database the other figures still count
+                log.warning("a figure is unknown", extra={"figure": name, "error": str(error)})
                 continue
             for key, value in now.items():
                 family.add_metric([key], value)
@@ -90,7 +90,7 @@ class JsonLines(logging.Formatter):
         line |= {
             k: v
             for k, v in vars(record).items()
-            if k not in _OWN and k not in ("message", "asctime", "color_message")
+            if k not in _STANDARD and k not in ("message", "asctime", "color_message")
         }
         if record.exc_info:
             line["traceback"] = self.formatException(record.exc_info)
@@ -98,7 +98,7 @@ class JsonLines(logging.Formatter):
 
 
 def log_json() -> None:
-    """Everything that this process logs goes to stderr as lines of JSON."""
+    """Write all logs of this process to stderr as lines of JSON."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonLines())
     logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)

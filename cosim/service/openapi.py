@@ -15,10 +15,10 @@ JSON = "application/json"
 SCHEME = {
     "type": "http",
     "scheme": "bearer",
-    "description": "the server's token: COSIM_TOKEN, or DATA/token of the server; not asked for on loopback",
+    "description": "the server's token: COSIM_TOKEN, or DATA/token of the server; not needed on loopback",
 }
 RETRY_AFTER = {
-    "description": "s, after which it may be carried out",
+    "description": "s, after which the request may be repeated",
     "schema": {"type": "integer", "example": Unavailable.retry_after},
 }
 PROBLEM = {
@@ -186,7 +186,7 @@ EXAMPLES: dict[str, Any] = {
 
 
 def describe(app: FastAPI) -> None:
-    """Have the application answer `/openapi.json` with it."""
+    """Have the application answer `/openapi.json` with this description."""
 
     def document() -> dict[str, Any]:
         if app.openapi_schema is None:

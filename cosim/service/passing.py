@@ -9,14 +9,14 @@ from cosim.errors import BadInput, CosimError, SimulationCrashed
 
 
 def may_pass(problem: BaseException) -> bool:
-    """All but what is wrong with the request itself: a BadInput that no fault of the machine's led to."""
+    """Whether a retry may succeed: False for a BadInput that was not caused by a fault of the machine."""
     reason = problem.__context__ if isinstance(problem, BadInput) else problem
     return reason is problem or isinstance(reason, OSError | SQLAlchemyError | SimulationCrashed)
 
 
 @contextlib.contextmanager
 def told_apart() -> Iterator[None]:
-    """A BadInput of the block that may pass leaves it as a CosimError: what led to it crosses no process."""
+    """Turn a transient BadInput of the block into a CosimError, since its cause does not cross processes."""
     try:
         yield
     except BadInput as problem:

@@ -16,7 +16,7 @@ from cosim.service.settings import Limits
 
 
 class Planner:
-    """Hosted in a process, which is confined where the files are an upload's."""
+    """Hosted in a process, which is confined if it reads an upload."""
 
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
@@ -32,7 +32,7 @@ class Planner:
         return found
 
     def plan_again(self, cases: Sequence[EpisodeOptions], seeds: range) -> Plan:
-        """The plan of a run that was begun."""
+        """The plan of a run that has begun."""
         with told_apart():
             return matrix.plan(cases, seeds, check)
 
@@ -44,7 +44,7 @@ class Planner:
         return scenario
 
     def _check_length(self, scenario: Scenario) -> None:
-        """Raises BadInput for an episode that would hold a process for ever."""
+        """Raises BadInput for an episode longer than `limits.simulated`."""
         most = self._limits.simulated
         if scenario.warmup + scenario.duration > most:
             problem = f"an episode and its warm-up have at most {most:g} s"

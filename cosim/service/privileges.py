@@ -10,7 +10,7 @@ NOBODY = 64_000  # user and group without an account, in systemd's range for ser
 _CHOWN, _READ_SEARCH, _SETGID, _SETUID = 1 << 0, 1 << 2, 1 << 6, 1 << 7  # linux/capability.h
 _VERSION = 0x20080522
 _SET_END, _GET_END, _KEEP, _SECURE = 1, 2, 8, 28  # PR_SET_PDEATHSIG, PR_GET_, PR_SET_KEEPCAPS, _SECUREBITS
-_NO_FIXUP = 1 << 2  # SECBIT_NO_SETUID_FIXUP: access(2), by which SUMO looks for files, heeds what was kept
+_NO_FIXUP = 1 << 2  # SECBIT_NO_SETUID_FIXUP: access(2), which SUMO uses, respects kept capabilities
 
 
 def droppable() -> bool:
@@ -43,7 +43,7 @@ def drop(folders: Iterable[str]) -> None:
     sets = (ctypes.c_uint32 * 6)(kept, kept, 0, 0, 0, 0)  # effective, permitted, inheritable; once more
     if libc.capset(head, sets):
         raise CosimError(f"capabilities: {os.strerror(ctypes.get_errno())}")
-    libc.prctl(_SET_END, ended_by.value, 0, 0, 0)  # a change of user forgot it
+    libc.prctl(_SET_END, ended_by.value, 0, 0, 0)  # reset by the change of user
 
 
 def tasks() -> int:
@@ -54,13 +54,13 @@ def tasks() -> int:
             try:
                 if os.stat(entry).st_uid == user:
                     number += len(os.listdir(f"/proc/{entry.name}/task"))
-            except OSError:  # it has ended
+            except OSError:  # the process has ended
                 continue
     return number
 
 
 def _capabilities() -> int:
-    """Those of this process that are in effect, a bit each."""
+    """The effective capabilities of this process, one bit each."""
     head = (ctypes.c_uint32 * 2)(_VERSION, 0)
     sets = (ctypes.c_uint32 * 6)()
     return 0 if ctypes.CDLL(None).capget(head, sets) else int(sets[0])

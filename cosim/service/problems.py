@@ -4,26 +4,26 @@ from cosim.errors import CosimError
 
 
 class Refused(CosimError):
-    """A request that is not carried out, for a reason that is no fault of the server's."""
+    """A request that is not carried out, although the server works."""
 
     status = 400
-    retry_after: int | None = None  # s, after which it may be carried out
+    retry_after: int | None = None  # s, after which the request may be repeated
 
 
 class NotFound(Refused):
-    """There is nothing of that id or name."""
+    """Nothing has that id or name."""
 
     status = 404
 
 
 class Conflict(Refused):
-    """It is not in the state that the request needs."""
+    """The request is not possible in the present state."""
 
     status = 409
 
 
 class Unavailable(Refused):
-    """The server is at its limit: later it will do."""
+    """The server is at its limit; a later request may succeed."""
 
     status = 429
     retry_after = 5

@@ -13,7 +13,7 @@ from cosim.workers.worker import Worker
 
 
 class Processes:
-    """Those of a server; `close` ends them."""
+    """The processes of a server; `close` ends them."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -22,11 +22,11 @@ class Processes:
 
     @contextlib.contextmanager
     def host(self, factory: Callable[..., Any], *arguments: Any, **options: Any) -> Iterator[Worker]:
-        """A `Worker`, which ends with the block. Raises Conflict when the server ends."""
+        """A `Worker`, which ends with the block. Raises Conflict during shutdown."""
         with Worker(factory, *arguments, wait=False, **options) as worker:
             with self._lock:
                 if self._closed:
-                    raise Conflict("the server ends")
+                    raise Conflict("the server is shutting down")
                 self._workers.add(worker)
             try:
                 yield worker
@@ -37,10 +37,10 @@ class Processes:
     def ask(
         self, name: str, limit: float, made_of: tuple[Callable[..., Any], Any], method: str, *arguments: Any
     ) -> Any:
-        """One answer of a process `name`, made of a factory and its argument, within `limit` s.
+        """One answer of a process `name`, made from a factory and its argument, within `limit` s.
 
-        The time is counted whatever progress the process reports. Raises what the method raises,
-        SimulationCrashed, SimulationTimeout.
+        Progress does not extend the limit. Raises what the method raises, SimulationCrashed,
+        SimulationTimeout.
         """
         late = threading.Event()
         with self.host(*made_of, timeout=limit, name=name) as worker:
@@ -61,7 +61,7 @@ class Processes:
                 clock.cancel()
 
     def close(self) -> None:
-        """End them at once."""
+        """End all processes at once."""
         with self._lock:
             self._closed = True
             for worker in self._workers:

@@ -7,8 +7,8 @@ import logging
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 
-PATIENCE = 3.0  # s that a part may take to answer
-Check = Callable[[], str | None]  # what is wrong; None: nothing
+TIMEOUT = 3.0  # s for the answer of a part
+Check = Callable[[], str | None]  # the problem; None: no problem
 log = logging.getLogger("cosim.service")
 
 
@@ -21,20 +21,20 @@ class Readiness:
         self._asked: dict[str, Future[str | None]] = {}
 
     async def problems(self) -> dict[str, str]:
-        """What is wrong, by part; a part that has not answered the last time is not asked once more."""
+        """Problems by part. A part whose last check is still running is not checked again."""
         for part, check in self._checks.items():
             if part not in self._asked or self._asked[part].done():
                 self._asked[part] = self._threads.submit(_outcome, part, check)
         asked = dict(self._asked)
-        await asyncio.wait([asyncio.wrap_future(future) for future in asked.values()], timeout=PATIENCE)
+        await asyncio.wait([asyncio.wrap_future(future) for future in asked.values()], timeout=TIMEOUT)
         said = {
-            part: future.result() if future.done() else f"no answer within {PATIENCE:g} s"
+            part: future.result() if future.done() else f"no answer within {TIMEOUT:g} s"
             for part, future in asked.items()
         }
         return {part: problem for part, problem in said.items() if problem is not None}
 
     def close(self) -> None:
-        """Ask no more."""
+        """End the checks."""
         self._threads.shutdown(wait=False, cancel_futures=True)
 
 

@@ -47,8 +47,8 @@ class Replays:
         """The page of an episode, named by its key or seed.
 
         Raises NotFound, Conflict unless the run has finished, Unavailable when too many wait. The future
-        raises BadInput where the run has no such episode or what drove it has changed, Conflict where the
-        episode driven again is another one.
+        raises BadInput if the run has no such episode, or if files, weights or code have changed; Conflict if
+        the replay differs from the episode.
         """
         job = self._runs.get(run)
         found = self._runs.files(run)
@@ -78,19 +78,19 @@ class Replays:
         if page.is_file():
             return page
         for upload in uploads:
-            self._uploads.get(upload)  # raises NotFound: it was deleted since
+            self._uploads.get(upload)  # raises NotFound for a deleted upload
         with tempfile.TemporaryDirectory(dir=self._settings.scratch) as folder:
             draft = Path(folder) / page.name
             self._draw(uploads, draft, case, manifest, trace_hash)
             with contextlib.suppress(OSError):
-                if draft.is_file() and not draft.is_symlink():  # it may come from a confined process
+                if draft.is_file() and not draft.is_symlink():  # not trusted: from a confined process
                     os.replace(draft, page)
         if page.name not in self._runs.files(run):
-            raise NotFound(f"run {run} was deleted meanwhile")
+            raise NotFound(f"run {run} has been deleted")
         return page
 
     def _draw(self, uploads: list[str], draft: Path, *episode: Any) -> None:
-        """Write the page of an episode, as `Drawer.page` wants it."""
+        """Write the page of an episode; `episode`: the first arguments of `Drawer.page`."""
         settings = self._settings
         self._warmth.wait()
         with (
@@ -113,5 +113,5 @@ class Replays:
 
 
 def name(episode: str) -> str:
-    """Of the page of an episode, by its key."""
+    """The file name of an episode's page, by the episode's key."""
     return f"replay-{episode}.html"

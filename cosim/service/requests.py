@@ -17,24 +17,24 @@ from cosim.scenario import sensing
 from cosim.scenario.options import MEASURED, OPTIONS, Option
 from cosim.scenario.sumo_outputs import OUTPUTS
 
-LONGEST = 1000  # characters of a text, items of a list
+MAX_LENGTH = 1000  # characters of a text, items of a list
 _NAME = re.compile(r"[\w+-]+(\.[\w+-]+)*", re.ASCII)
 _FILE = re.compile(r".*\.(ya?ml|json|xml|gz|py|safetensors|sumocfg)", re.IGNORECASE)
 _LABEL = re.compile(r"(?:([\w.+-]+)=)?upload:([0-9a-f]{12})", re.ASCII)
-Find = Callable[[str, str], Path]  # an upload's id, what it must be -> its file; raises BadInput
-_ALLOWED: dict[str, Iterable[str]] = {  # names alone: no code is taken, and SUMO writes no other file
+Find = Callable[[str, str], Path]  # upload's id, required kind -> its file; raises BadInput
+_ALLOWED: dict[str, Iterable[str]] = {  # only names, so that no code is read and SUMO writes no other file
     **{o.name: o.choices for o in OPTIONS.values() if o.choices},
     "reward": REWARDS,
     "output": OUTPUTS,
 }
-_ABOUT = {  # where HTTP takes less than the command line
+_ABOUT = {  # options for which HTTP accepts less than the command line
     "scenario": f"scenarios by name ({', '.join(sumo_scenarios.names())}, open/NAME), or upload:ID",
     "demand": "by name (free, dense, contested), or files of the upload; A,B is one demand of two files",
     "policy": f"by name ({', '.join(POLICIES)}), upload:ID or LABEL=upload:ID",
     "errors": "of human drivers: none (default), field or stress",
     "sensing": "of AVs: ideal (default), radar-camera, v2v or harsh; parameters behind it: v2v,delay=0.8",
-    "reward": "report what AVs earn by it",
-    "metric": "refused: code is not taken over HTTP",
+    "reward": "reward function whose sums are reported",
+    "metric": "refused: code is not accepted over HTTP",
 }
 EXAMPLE: dict[str, Any] = {
     "name": "two policies on the contested merge",
@@ -73,7 +73,7 @@ _fields: dict[str, Any] = {o.name: _field(o, _schema(o, o.axis or o.several)) fo
 class _Base(BaseModel):
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [EXAMPLE]})
 
-    name: Annotated[str, Field(max_length=200, description="what lists call it")] = ""
+    name: Annotated[str, Field(max_length=200, description="title in lists")] = ""
 
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ else:
     RunRequest.__doc__ = "The matrix of a run: the fields of `cosim evaluate`, by the same names and rules."
 
 
-# A session has one value of each axis; its seeds, reward and outputs are its own.
+# A session has one value of each axis, and its own fields for seed and reward.
 _ONE: dict[str, Any] = {
     o.name: _field(o, _schema(o, False)["anyOf"][0]) for o in OPTIONS.values() if o.scope != MEASURED
 }
@@ -94,10 +94,10 @@ class _Session(BaseModel):
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [SESSION_EXAMPLE]})
 
     seed: StrictInt | None = Field(None, ge=0, lt=2**62, description="of the first episode")
-    reward: Literal[tuple(REWARDS)] = Field("p", description="what AVs are paid")  # type: ignore[valid-type]
+    reward: Literal[tuple(REWARDS)] = Field("p", description="reward function of AVs")  # type: ignore[valid-type]
     maps: StrictBool = Field(True, description="whether VelocityMaps are drawn")
     idle_s: float | None = Field(
-        None, gt=0.0, le=1e6, allow_inf_nan=False, description="ends by itself after so long"
+        None, gt=0.0, le=1e6, allow_inf_nan=False, description="idle time after which the session ends"
     )
 
 
@@ -105,17 +105,19 @@ if TYPE_CHECKING:
     SessionRequest = _Session
 else:
     SessionRequest = create_model("SessionRequest", __base__=_Session, **_ONE)
-    SessionRequest.__doc__ = "What a session drives; `policy` commands the AVs that the caller does not."
+    SessionRequest.__doc__ = (
+        "The scenario of a session; `policy` commands the AVs without a caller's command."
+    )
 
 
 def flags(
     request: BaseModel, find: Find, leave: Iterable[str] = ("name",)
 ) -> tuple[dict[str, Any], list[str]]:
-    """The flags of `cosim.batch.spec.read`, every file a file of an upload; and the uploads' ids.
+    """The flags of `cosim.batch.spec.read`, with files only from uploads, and the uploads' ids.
 
-    `leave`: fields of the request that are no flags.
+    `leave`: fields of the request that are not flags.
 
-    Raises BadInput: a path, code or a glob where a name is wanted, an upload that is not there.
+    Raises BadInput: a path, code or a glob instead of a name; an unknown upload.
     """
     given = request.model_dump(exclude_unset=True)
     given = {name: value for name, value in given.items() if name not in leave}
@@ -134,14 +136,14 @@ def plain(value: object, field: str = "", depth: int = 0) -> None:
         for name, item in value.items():
             plain(item, str(name) if not depth else field, depth + 1)
     elif isinstance(value, list):
-        problem = "" if 0 < len(value) <= LONGEST else f"a list of 1 to {LONGEST} is needed"
-        for item in value[:LONGEST]:
+        problem = "" if 0 < len(value) <= MAX_LENGTH else f"a list of 1 to {MAX_LENGTH} is needed"
+        for item in value[:MAX_LENGTH]:
             plain(item, field, depth + 1)
     elif isinstance(value, str):
-        if len(value) > LONGEST:
-            problem = f"a text of at most {LONGEST} characters is taken"
+        if len(value) > MAX_LENGTH:
+            problem = f"a text of at most {MAX_LENGTH} characters is accepted"
         elif not value.isprintable():
-            problem = "holds characters that cannot be printed"
+            problem = "contains characters that cannot be printed"
     elif isinstance(value, int | float) and not isinstance(value, bool):
         problem = "" if abs(value) < 2.0**63 and math.isfinite(value) else "is out of range"
     if depth > 4:
@@ -151,9 +153,9 @@ def plain(value: object, field: str = "", depth: int = 0) -> None:
 
 
 def _axis(name: str, value: Any, find: Find, uploads: list[str]) -> Any:
-    """A field whose texts are safe to be read as flags."""
+    """The value of a field, with texts that are safe as flags."""
     if name == "metric" and value is not None:
-        raise BadInput("code is not taken over HTTP", field=name, value=value)
+        raise BadInput("code is not accepted over HTTP", field=name, value=value)
     if name in ("scenario", "policy"):
         items = value if isinstance(value, list) else [value]
         return [_named(name, item, find, uploads) for item in items]
@@ -165,7 +167,7 @@ def _axis(name: str, value: Any, find: Find, uploads: list[str]) -> Any:
         for item in value if isinstance(value, list) else [value]:
             text = sensing.base(item) if name == "sensing" and isinstance(item, str) else item
             if isinstance(text, str) and not _is_name(text):
-                raise BadInput("is no name: no file or code is read", field=name, value=item)
+                raise BadInput("a name is needed: no file or code is read", field=name, value=item)
     return value
 
 
@@ -174,7 +176,7 @@ def _is_name(text: str) -> bool:
 
 
 def _named(name: str, item: Any, find: Find, uploads: list[str]) -> str:
-    """A world or a policy: its name, or the file of an upload."""
+    """A scenario or a policy: its name, or the file of an upload."""
     known = POLICIES if name == "policy" else sumo_scenarios.shipped()
     if not isinstance(item, str):
         raise BadInput("text is needed", field=name, value=item)
@@ -186,12 +188,13 @@ def _named(name: str, item: Any, find: Find, uploads: list[str]) -> str:
         file = find(upload[2], name)
         return f"{upload[1] or file.stem}={file}" if name == "policy" else str(file)
     if not _is_name(item):
-        raise BadInput("name one that ships, or upload:ID: no file or code is read", field=name, value=item)
+        problem = f"a shipped {name} or upload:ID is needed: no file or code is read"
+        raise BadInput(problem, field=name, value=item)
     raise BadInput(f"no such {name}{hint(item, known)}", field=name, value=item)
 
 
 def _demand(value: Any, scenario: Any, uploads: list[str]) -> list[str]:
-    """Names of demands as they are, files by their paths in the one upload that is the scenario."""
+    """Demands: names unchanged, files by their paths in the upload that is the only scenario."""
     found = []
     for item in value if isinstance(value, list) else [value]:
         if not isinstance(item, str):
@@ -201,7 +204,7 @@ def _demand(value: Any, scenario: Any, uploads: list[str]) -> list[str]:
             found.append(item)
             continue
         if not (scenario and len(scenario) == 1 and uploads and uploads[0] in scenario[0]):
-            problem = "files are taken of an upload that is the only scenario"
+            problem = "files are accepted only from an upload that is the only scenario"
             raise BadInput(problem, field="demand", value=item)
         folder = next(p for p in Path(scenario[0]).parents if p.name == uploads[0])
         files = []

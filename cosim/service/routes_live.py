@@ -1,4 +1,4 @@
-"""Watching a session: a WebSocket that tells what is driven and is asked to drive (service.md)."""
+"""Watching a session: a WebSocket that sends the drive and receives requests to drive (service.md)."""
 
 import asyncio
 import contextlib
@@ -17,18 +17,18 @@ GONE, FAULTY = 4404, 4400  # codes of a closed socket
 
 
 class Asked(BaseModel):
-    """What a page asks of the session that it watches."""
+    """A request of a page to the session that it watches."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     until: float | None = Field(None, ge=0.0, le=1e9)  # drive up to so many s of the episode
     begin: StrictInt | None = Field(None, ge=0, lt=2**62)  # the episode of this seed
-    next: bool = False  # the episode after the last
-    explain: str | None = Field(None, max_length=200)  # the AV whose choices are explained; "": none
+    next: bool = False  # the episode of the next seed
+    explain: str | None = Field(None, max_length=200)  # the AV for attribution; "": no AV
 
 
 def live_router(sessions: Sessions, lane: Lane) -> APIRouter:
-    """The one route."""
+    """The route of viewers."""
     router = APIRouter(prefix="/api")
 
     @router.websocket("/sessions/{session}/live")

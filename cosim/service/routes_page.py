@@ -1,4 +1,4 @@
-"""The page: HTML, styles and scripts from this package alone, and the form that asks for the token."""
+"""The pages: HTML, styles and scripts, all from this package, and the login form for the token."""
 
 import hmac
 from importlib import resources
@@ -21,7 +21,7 @@ HTML, CSS, JS = "text/html", "text/css", "text/javascript"
 
 
 def page_router(settings: Settings) -> APIRouter:
-    """All of them; none is part of the API."""
+    """All routes of pages; they are not part of the API."""
     router = APIRouter(include_in_schema=False)
     parts = {
         "viewer.css": (CSS, asset("style.css")),
@@ -63,7 +63,7 @@ def page_router(settings: Settings) -> APIRouter:
         given = parse_qs((await request.body()).decode("utf-8", "replace")).get("token", [""])[0].strip()
         token = settings.token or ""
         if token and not hmac.compare_digest(given.encode(), token.encode()):
-            return answer(HTML, form.substitute(head=head, said="That is not the token."), 401)
+            return answer(HTML, form.substitute(head=head, said="This token is wrong."), 401)
         found = Response(status_code=303, headers={"Location": "/"})
         if token:
             secure = request.url.scheme == "https"

@@ -17,7 +17,7 @@ from cosim.service.jobs import STATUSES, Job
 from cosim.service.lanes import Lanes
 from cosim.service.problems import Conflict, NotFound
 from cosim.service.replays import Replays
-from cosim.service.requests import EXAMPLE, LONGEST, RunRequest, flags, plain
+from cosim.service.requests import EXAMPLE, MAX_LENGTH, RunRequest, flags, plain
 from cosim.service.runs import REPORT, SUMMARY, Runs
 from cosim.service.uploads import Uploads
 
@@ -28,12 +28,12 @@ Episode = Annotated[
     str,
     Query(
         pattern=r"^([0-9a-f]{12}-)?[0-9]{1,19}$",
-        description="its key, or its seed where only one episode has it",
+        description="key of the episode, or its seed if only one episode has the seed",
         examples=["5d0c3e9f1a27-200000", "200000"],
     ),
 ]
-Texts = Annotated[list[Annotated[str, Query(max_length=LONGEST)]], Query(max_length=20)]
-# Restrictions of a report, because it contains users' names.
+Texts = Annotated[list[Annotated[str, Query(max_length=MAX_LENGTH)]], Query(max_length=20)]
+# Restrictions of a report, because it contains texts of users.
 SANDBOX = {
     "Content-Security-Policy": "sandbox allow-scripts; default-src 'none'; img-src data:; "
     "style-src 'unsafe-inline'; script-src 'unsafe-inline'; font-src data:"
@@ -42,7 +42,7 @@ Status = Enum("Status", {name: name for name in STATUSES}, type=str)  # type: ig
 
 
 def runs_router(runs: Runs, replays: Replays, uploads: Uploads, lanes: Lanes) -> APIRouter:
-    """All of them."""
+    """All routes of runs."""
     router = APIRouter(prefix="/api", tags=["runs"])
 
     def asked(request: BaseModel) -> tuple[dict[str, Any], list[str]]:
@@ -86,7 +86,7 @@ def runs_router(runs: Runs, replays: Replays, uploads: Uploads, lanes: Lanes) ->
         sent = request.model_dump(exclude_unset=True)
         return document(runs.submit(str(sent.pop("name", "")), sent, given, used))
 
-    @router.post("/estimates", summary="How long a run would take; drives a few short episodes of it")
+    @router.post("/estimates", summary="Estimate the time of a run by a few short episodes")
     @lanes.estimates
     def estimate(request: Requested) -> Estimate:
         return Estimate(**runs.estimate(*asked(request)))
@@ -107,7 +107,7 @@ def runs_router(runs: Runs, replays: Replays, uploads: Uploads, lanes: Lanes) ->
         ]
         return RunList(total=len(found), runs=[document(job) for job in found[offset : offset + limit]])
 
-    @router.get("/runs/{run}", summary="One run and how far it is")
+    @router.get("/runs/{run}", summary="One run and its progress")
     @lanes.reads
     def status(run: RunId) -> RunDocument:
         return document(runs.get(run))
@@ -117,14 +117,14 @@ def runs_router(runs: Runs, replays: Replays, uploads: Uploads, lanes: Lanes) ->
     def cancel(run: RunId) -> RunDocument:
         return document(runs.cancel(run))
 
-    @router.post("/runs/{run}/resume", summary="Go on with a run that failed or was cancelled")
+    @router.post("/runs/{run}/resume", summary="Continue a failed or cancelled run")
     @lanes.reads
     def resume(run: RunId) -> RunDocument:
         for upload in runs.get(run).uploads:
             uploads.get(upload)
         return document(runs.resume(run))
 
-    @router.delete("/runs/{run}", status_code=204, summary="Forget a run that has ended, and its files")
+    @router.delete("/runs/{run}", status_code=204, summary="Delete a run that has ended, and its files")
     @lanes.reads
     def remove(run: RunId) -> None:
         runs.remove(run)
@@ -155,7 +155,7 @@ def runs_router(runs: Runs, replays: Replays, uploads: Uploads, lanes: Lanes) ->
 
     @router.get(
         "/runs/{run}/replay",
-        summary="An episode driven again and drawn: one HTML file, as `cosim replay` makes it",
+        summary="An episode driven again and drawn: the HTML file of `cosim replay`",
         response_class=FileResponse,
         responses={200: {"content": {"text/html": {"example": "<!DOCTYPE html>..."}}}},
     )
@@ -175,7 +175,7 @@ def runs_router(runs: Runs, replays: Replays, uploads: Uploads, lanes: Lanes) ->
     def artefact(run: RunId, name: Annotated[str, Path(examples=["episodes.csv"])]) -> Response:
         return file(run, name, SANDBOX)
 
-    @router.get("/compare", summary="Two runs, or two policies, on equal seeds: what `cosim compare` says")
+    @router.get("/compare", summary="Compare two runs, or two policies, on equal seeds, as `cosim compare`")
     @lanes.tables
     def compare(a: Side, b: Side, fail_on: Texts = [], across: Texts = []) -> dict[str, Any]:  # noqa: B006
         for text in (*fail_on, *across):
@@ -188,6 +188,6 @@ def runs_router(runs: Runs, replays: Replays, uploads: Uploads, lanes: Lanes) ->
 
 
 def _names(job: Job, field: str, wanted: str | None) -> bool:
-    """Whether the run was asked for with this value of a field."""
+    """Whether the run's request has the value `wanted` in a field; None: any."""
     given = job.request.get(field, "idm" if field == "policy" else "")
     return wanted is None or wanted in (given if isinstance(given, list) else [given])

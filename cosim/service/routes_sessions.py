@@ -25,7 +25,7 @@ AVS, MAPS = "/sessions/{session}", "application/octet-stream"
 
 
 class Continuous(BaseModel):
-    """An acceleration in place of a meta-action."""
+    """An acceleration instead of a meta-action."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
@@ -36,11 +36,11 @@ class Continuous(BaseModel):
 
 
 class Reset(BaseModel):
-    """Which episode begins."""
+    """The episode to begin."""
 
     model_config = ConfigDict(extra="forbid")
 
-    seed: StrictInt | None = Field(None, ge=0, lt=2**62, description="default: the one after the last")
+    seed: StrictInt | None = Field(None, ge=0, lt=2**62, description="default: the next seed")
 
 
 class Act(BaseModel):
@@ -56,9 +56,9 @@ class Act(BaseModel):
     actions: dict[str, StrictInt | str | Continuous | None] = Field(
         max_length=10_000,
         description="AV -> meta-action by name or number (LANE_LEFT, IDLE, LANE_RIGHT, ACCELERATE, "
-        "DECELERATE: 0 to 4), or acceleration and lane offset; the named policy drives those left out",
+        "DECELERATE: 0 to 4), or acceleration and lane offset; the session's policy commands all other AVs",
     )
-    see: list[str] | None = Field(None, max_length=10_000, description="AVs to be observed (default: all)")
+    see: list[str] | None = Field(None, max_length=10_000, description="AVs to observe (default: all)")
 
 
 class SessionDocument(BaseModel):
@@ -73,16 +73,16 @@ class SessionDocument(BaseModel):
     preset: str
     fleet: str
     duration: float = Field(description="counted s of an episode")
-    warmup: float = Field(description="s before")
+    warmup: float = Field(description="s of the warm-up before")
     decision: float = Field(description="s between decisions")
     over: bool = Field(description="the episode is over, or none has begun")
-    idle_s: float = Field(description="it ends by itself after so long without a request")
-    watched: int = Field(description="pages that watch it")
-    program: bool = Field(description="requests drive it")
+    idle_s: float = Field(description="s without a request after which the session ends")
+    watched: int = Field(description="number of pages that watch the session")
+    program: bool = Field(description="whether a program drives the session by requests")
 
 
 class Step(BaseModel):
-    """What a reset or an act brought; all but the first six fields of an act only. AVs by their ids."""
+    """The result of a reset or an act, by AV; a reset has only the first six fields."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -106,7 +106,7 @@ PNG: dict[int | str, dict[str, Any]] = {200: {"content": {"image/png": {}}}}
 
 
 def sessions_router(sessions: Sessions, uploads: Uploads, lanes: Lanes) -> APIRouter:
-    """All of them."""
+    """All routes of sessions."""
     router = APIRouter(prefix="/api", tags=["sessions"])
 
     def document(one: Open) -> SessionDocument:
@@ -192,7 +192,7 @@ def sessions_router(sessions: Sessions, uploads: Uploads, lanes: Lanes) -> APIRo
             if not wants_bytes(accept):
                 found.check_observed()
             elif not found.passes_on:
-                raise Conflict("this episode was begun to be answered in JSON: reset first")
+                raise Conflict("this episode began with JSON answers: reset first")
             one.live.program = True
             result = one.act(actions, decision.see)
             if found.passes_on:
@@ -264,12 +264,14 @@ def _known(av: str, avs: tuple[str, ...]) -> None:
 
 
 def _action(av: str, action: int | str | Continuous | None) -> int | ContinuousAction | None:
-    """What a session takes. Raises BadInput for a word that is no meta-action."""
+    """The action for the session. Raises BadInput for an unknown meta-action."""
     plain(av, "actions")
     if isinstance(action, Continuous):
         return ContinuousAction(float(action.accel), action.lane_offset)
     if isinstance(action, str):
         if action not in MetaAction.__members__:
-            raise BadInput(f"is no meta-action{hint(action, MetaAction.__members__)}", field=av, value=action)
+            raise BadInput(
+                f"is not a meta-action{hint(action, MetaAction.__members__)}", field=av, value=action
+            )
         return MetaAction[action]
     return action

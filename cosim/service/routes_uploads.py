@@ -48,7 +48,7 @@ class UploadDocument(BaseModel):
 def uploads_router(
     uploads: Uploads, runs: Runs, sessions: Sessions, settings: Settings, lanes: Lanes
 ) -> APIRouter:
-    """All of them."""
+    """All routes of uploads."""
     router = APIRouter(prefix="/api", tags=["uploads"])
 
     @router.post("/uploads", status_code=201, summary="Send a scenario or weights", openapi_extra=BODY)
@@ -56,10 +56,10 @@ def uploads_router(
         request: Request, kind: Kind, name: Annotated[str, Query(max_length=200)] = ""
     ) -> UploadDocument:
         if problem := lacking():
-            raise HTTPException(403, f"{problem}: none are taken")
+            raise HTTPException(403, f"{problem}: none are accepted")
         handle, path = tempfile.mkstemp(suffix=".zip", dir=settings.scratch)
         try:
-            os.fchmod(handle, 0o644)  # what unpacks it may be another user
+            os.fchmod(handle, 0o644)  # the process that unpacks it may have another user
             with os.fdopen(handle, "wb") as file:
                 async for chunk in request.stream():
                     file.write(chunk)

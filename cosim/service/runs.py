@@ -1,4 +1,4 @@
-"""The runs of a server: submitted, queued, driven a few at a time, cancelled, resumed, tried again."""
+"""The runs of a server: submitted, queued, driven a few at a time, cancelled, resumed, retried."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ RETRY = 5.0  # s until an unusable database is tried again, and until the first 
 TRIES = 8  # retries without a new row, each after twice the time, 21 min in all
 ACTIVE = 8  # concurrent runs on the processes of this machine
 REPORT, SUMMARY = "report.html", "summary.json"
-OUTPUTS = "outputs"  # the folder of SUMO's own
+OUTPUTS = "outputs"  # folder of SUMO's output files
 T = TypeVar("T")
 log = logging.getLogger("cosim.service")
 
@@ -56,7 +56,7 @@ class Drive:
         self.before = 0  # episodes of an earlier server
         self.began = time.monotonic()
         self.cancelled = threading.Event()
-        self.left = False  # to another server, or the next start
+        self.left = False  # left to another server, or to the next start
         self.engine: Engine | None = None
 
     def leave(self) -> None:
@@ -65,25 +65,25 @@ class Drive:
         self.cancel()
 
     def cancel(self) -> None:
-        """End it at once."""
+        """End the drive at once."""
         self.cancelled.set()
         if isinstance(self.engine, PoolEngine | RayEngine):
             self.engine.cancel()
 
     def progress(self, done: int) -> None:
-        """`done` episodes of those that were left. Raises Cancelled."""
+        """`done` of the remaining episodes are driven. Raises Cancelled."""
         self.done = self.before + done
         if self.cancelled.is_set():
             raise Cancelled
 
     @property
     def running(self) -> dict[str, tuple[float, float]]:
-        """Episode -> simulated s so far, of s in all (0 of 0 while it starts)."""
+        """Episode -> (simulated s so far, total s); (0, 0) during the start."""
         return dict(self.engine.running) if isinstance(self.engine, PoolEngine) else {}
 
     @property
     def seconds_left(self) -> float | None:
-        """s of wall time at the rate so far; None while that is not known."""
+        """s of wall time at the rate so far; None before the first episode."""
         driven = self.done - self.before
         if not driven:
             return None
@@ -94,30 +94,30 @@ class Waiting:
     """A run that waits for a retry after a transient fault."""
 
     def __init__(self, tries: int, rows: int) -> None:
-        self.tries = tries  # so far, since it had fewer rows
-        self.rows = rows  # that it had when the last try began
+        self.tries = tries  # so far, without a new row
+        self.rows = rows  # when the last try began
         self.since = time.monotonic()
         self.seconds = RETRY * 2.0 ** (tries - 1)
 
     @property
     def left(self) -> float:
-        """s until it is tried again."""
+        """s until the retry."""
         return self.since + self.seconds - time.monotonic()
 
 
 class Runs:
-    """Every run of the server; `count` is told how many episodes were driven.
+    """Every run of the server; `count` is called with the number of newly driven episodes.
 
-    `start` it once; `close` leaves what runs and waits to the next start, and closes
-    the clerks. Nothing is driven while the database is another server's, or may be.
+    Call `start` once. `close` leaves running and waiting runs to the next start, and closes the clerks. No
+    run is driven while another server may have claimed the database.
     """
 
     def __init__(self, settings: Settings, jobs: Jobs, clerks: Clerks, count: Callable[[int], None]) -> None:
         self._settings, self._jobs, self._clerks, self._count = settings, jobs, clerks, count
         self._changed = threading.Condition()
         self._queue: deque[str] = deque()
-        self._plans: dict[str, Plan] = {}  # of runs that wait, as they were checked
-        self._waiting: dict[str, Waiting] = {}  # of those that were tried before
+        self._plans: dict[str, Plan] = {}  # run -> checked plan, while the run waits
+        self._waiting: dict[str, Waiting] = {}  # run -> its wait for a retry
         self._drives: dict[str, Drive] = {}
         self._driving = False
         self._closed = False
@@ -128,10 +128,10 @@ class Runs:
         if settings.engine == "local":
             self.pool = Pool(settings.workers)
         else:
-            self._cluster = RayEngine(EpisodeRunner)  # raises BadInput where Ray is not installed
+            self._cluster = RayEngine(EpisodeRunner)  # raises BadInput if Ray is not installed
 
     def start(self) -> None:
-        """Go on with what an earlier server left, and take what comes."""
+        """Continue the runs of an earlier server, and accept new runs."""
         works = [(f"cosim-run-{k}", self._work) for k in range(ACTIVE if self.pool else 1)]
         if self._jobs.claim is None:
             self._take_up()
@@ -143,7 +143,7 @@ class Runs:
             self._threads.append(thread)
 
     def close(self) -> None:
-        """End what is driven: rows that are kept stay, the rest is driven after the next start."""
+        """End running episodes. Stored rows stay; the remaining episodes are driven after the next start."""
         with self._changed:
             self._closed = True
             for drive in self._drives.values():
@@ -159,14 +159,14 @@ class Runs:
             self._cluster.disconnect()
 
     def problem(self) -> str | None:
-        """Why runs are not driven now; None where they are."""
+        """The reason why runs cannot be driven now; None if they can."""
         if ended := sum(not thread.is_alive() for thread in self._threads):
             return f"{ended} of {len(self._threads)} threads have ended"
         if self.pool is not None and (lost := self.pool.workers - self.pool.alive):
-            return f"{lost} of {self.pool.workers} processes are supervised by nobody"
+            return f"{lost} of {self.pool.workers} processes have no supervisor"
         return None
 
-    # ---- what users ask ----
+    # ---- requests of users ----
 
     def submit(
         self, name: str, request: dict[str, Any], flags: dict[str, Any], uploads: Sequence[str]
@@ -183,7 +183,7 @@ class Runs:
                 job = self._jobs.add(run, name, request, uploads, plan.episodes)
                 self._plans[run] = plan
                 self._queue.append(run)
-                self._changed.notify_all()  # others than workers wait on it too
+                self._changed.notify_all()  # all, since not only workers wait
         except BaseException:
             self._forget(run)
             raise
@@ -210,16 +210,16 @@ class Runs:
         return self._jobs.all(status)
 
     def compare(self, a: str, b: str, fail_on: Sequence[str], across: Sequence[str]) -> dict[str, Any]:
-        """What `cosim compare --json` prints; `a`, `b`: RUN or RUN:POLICY. Raises BadInput."""
+        """The document of `cosim compare --json`; `a`, `b`: RUN or RUN:POLICY. Raises BadInput."""
         found: dict[str, Any] = self._clerks.call("compare", a, b, list(fail_on), list(across))
         return found
 
     def that_use(self, upload: str) -> str | None:
-        """A run that waits or is driven with this upload."""
+        """The id of a waiting or running run that uses this upload; None without one."""
         return next((job.run for job in self._jobs.open() if upload in job.uploads), None)
 
     def report(self, run: str) -> None:
-        """Write the report of a run that has finished, unless it is there."""
+        """Write the report of a finished run, unless it exists."""
         with self._reporting:  # two at once would write the same draft
             if SUMMARY in self.files(run) and REPORT not in self.files(run):
                 self._clerks.call("report", run)
@@ -234,7 +234,7 @@ class Runs:
             return self._queue.index(run) if run in self._queue else None
 
     def cancel(self, run: str) -> Job:
-        """End a run; the rows that it has are kept. Raises Conflict when it has ended."""
+        """End a run; its stored rows stay. Raises Conflict when it has ended."""
         self.get(run)
         with self._changed:
             if run in self._queue:
@@ -253,18 +253,18 @@ class Runs:
         return self.get(run)
 
     def resume(self, run: str) -> Job:
-        """Queue a run that failed or was cancelled: its rows are kept, what is missing is driven.
+        """Queue a failed or cancelled run, to drive its missing episodes.
 
-        Raises Conflict when it is none of these, Unavailable when too many wait.
+        Raises Conflict for a run of another status, Unavailable when too many wait.
         """
         self._check_queue()
         with self._changed:
-            self._changed.wait_for(lambda: run not in self._drives, timeout=ENDING)  # its last moments
+            self._changed.wait_for(lambda: run not in self._drives, timeout=ENDING)  # until it has ended
             if (status := self.get(run).status) not in (FAILED, CANCELLED):
-                raise Conflict(f"run {run} is {status}: a run that failed or was cancelled is resumed")
+                raise Conflict(f"run {run} is {status}: only a failed or cancelled run can be resumed")
             self._jobs.set(run, status=QUEUED, error=None, ended=None)
             self._queue.append(run)
-            self._changed.notify_all()  # others than workers wait on it too
+            self._changed.notify_all()  # all, since not only workers wait
         log.info("run resumed", extra={"run": run})
         return self.get(run)
 
@@ -293,7 +293,7 @@ class Runs:
 
     @contextlib.contextmanager
     def reading(self, run: str) -> Iterator[Path]:
-        """Its folder, to be read. Raises NotFound, also when it is removed meanwhile."""
+        """The folder of a run, for reading. Raises NotFound, also if the run is removed during the block."""
         self.get(run)
         try:
             yield self.folder(run)
@@ -302,7 +302,7 @@ class Runs:
             raise
 
     def folder(self, run: str) -> Path:
-        """Where it keeps its files."""
+        """The folder of a run."""
         return self._settings.runs / run
 
     # ---- inside ----
@@ -312,7 +312,7 @@ class Runs:
             raise Unavailable(f"{len(self._queue)} runs wait already: try again later")
 
     def _take_up(self) -> None:
-        """Go on with what the database says is to be driven."""
+        """Queue the open runs of the database."""
         with self._changed:
             found = [job.run for job in self._jobs.open()]
             for run in found:
@@ -337,10 +337,10 @@ class Runs:
                 self._changed.wait_for(lambda: self._closed, timeout=LOOKS)
 
     def _stand_by(self) -> None:
-        """Drive nothing: another server may."""
+        """Stop driving, because another server may drive the runs."""
         with self._changed:
             if self._driving:
-                log.error("the database is not this server's now: no run is driven")
+                log.error("another server may have claimed the database: no run is driven")
             self._driving = False
             for drive in self._drives.values():
                 drive.leave()
@@ -349,7 +349,7 @@ class Runs:
         return Store.in_folder(self.folder(run), self._settings.database)
 
     def _forget(self, run: str) -> None:
-        """Remove its rows and files."""
+        """Remove a run's rows and files."""
         if self._settings.database is not None:
             with contextlib.suppress(CosimError), self._store(run) as store:
                 store.remove()
@@ -359,7 +359,7 @@ class Runs:
         shutil.rmtree(gone, ignore_errors=True)
 
     def _engine(self, confined: Room | None = None, *, probes: bool = False) -> Engine:
-        """Of one run, or of `probes`; in a room its processes are confined."""
+        """The engine of one run, or of `probes`; in a room its processes are confined."""
         factory: Callable[..., Any] = LimitedRunner
         arguments: tuple[Any, ...] = (self._settings.limits,)
         if confined is not None:
@@ -373,14 +373,14 @@ class Runs:
         return RayEngine(factory, arguments, workers=workers, limits=once, address=address, keep=True)
 
     def _work(self) -> None:
-        """A thread: one run after the other."""
+        """A thread that drives one run after another."""
         while (run := self._next()) is not None:
             drive = self._drives[run]
             try:
                 self._run(self._patiently(self.get, run), self._plans.pop(run, None), drive)
             except Superseded:
                 log.warning("run left to another server", extra={"run": run})
-            except Exception:  # the database was gone until the server's end
+            except Exception:  # the database did not answer until the shutdown
                 log.exception("run lost until the next start", extra={"run": run})
             finally:
                 with self._changed:
@@ -389,7 +389,7 @@ class Runs:
                     self._changed.notify_all()
 
     def _next(self) -> str | None:
-        """The next run, whose drive begins; waits. None: the server ends."""
+        """Wait for the next run and begin its drive; None: the server shuts down."""
         with self._changed:
             while not self._closed:
                 left = {run: self._waiting[run].left if run in self._waiting else 0.0 for run in self._queue}
@@ -414,10 +414,10 @@ class Runs:
         except Cancelled:
             status = CANCELLED
         except Exception as problem:
-            status, error, passes = FAILED, self._said(run, problem), may_pass(problem)
-        if drive.left and status != FINISHED:  # the next start, or the next server, goes on with it
+            status, error, passes = FAILED, self._message(run, problem), may_pass(problem)
+        if drive.left and status != FINISHED:  # the next start, or another server, continues it
             return
-        if passes and self._again(run, drive, str(error)):
+        if passes and self._retry(run, drive, str(error)):
             return
         if passes and drive.cancelled.is_set():
             status, error = CANCELLED, None
@@ -428,18 +428,20 @@ class Runs:
         seconds = round(time.monotonic() - drive.began, 3)
         log.info("run ended", extra={"run": run, "status": status, "seconds": seconds})
 
-    def _said(self, run: str, problem: Exception) -> str:
+    def _message(self, run: str, problem: Exception) -> str:
         """The message for users, without internals of the server."""
         if isinstance(problem, BadInput):
             return str(shown(problem, self._settings))
-        if isinstance(problem, CosimError):  # a store names its database, the command line's way to go on
+        if isinstance(
+            problem, CosimError
+        ):  # messages of a store have its URL and a hint for the command line
             text = re.sub(r"\w[\w+]*://\S+?: ", "the database: ", _short(str(problem)))
             return text.replace(" (--resume continues from here)", "")
-        log.error("a fault of the server's own", exc_info=problem, extra={"run": run})
-        return f"a fault of the server's own: {type(problem).__name__}"
+        log.error("internal error", exc_info=problem, extra={"run": run})
+        return f"internal error: {type(problem).__name__}"
 
-    def _again(self, run: str, drive: Drive, error: str) -> bool:
-        """Queue a run that met a fault, unless it was tried often enough; later each time."""
+    def _retry(self, run: str, drive: Drive, error: str) -> bool:
+        """Queue a run again after a fault, each time with a longer delay; False after `TRIES` retries."""
         last = self._waiting.get(run)
         fresh = last is None or drive.before > last.rows
         wait = Waiting(1 if last is None or fresh else last.tries + 1, drive.before)
@@ -459,7 +461,7 @@ class Runs:
         return True
 
     def _patiently(self, ask: Callable[..., T], *arguments: Any, **values: Any) -> T:
-        """What the database answers, as soon as it does; raises SQLAlchemyError if the server ends before."""
+        """The database's answer, with retries until it answers. Raises SQLAlchemyError during shutdown."""
         while True:
             try:
                 return ask(*arguments, **values)
@@ -471,12 +473,12 @@ class Runs:
                     self._changed.wait(timeout=RETRY)
 
     def _episodes(self, job: Job, plan: Plan | None, drive: Drive) -> list[str]:
-        """Drive what is left of a run, write its tables and report; the faults of our own code."""
+        """Drive the missing episodes of a run and write its tables; returns internal errors, a line each."""
         run, folder = job.run, self.folder(job.run)
         if plan is None:
             cases, seeds = execution.asked(folder, self._settings.database)
             plan = self._clerks.plan_again(cases, seeds, job.uploads)
-        (folder / OUTPUTS).mkdir(parents=True, exist_ok=True)  # it may be another server's run
+        (folder / OUTPUTS).mkdir(parents=True, exist_ok=True)  # the run may be from another server
         with RunFolder(str(folder), resume=True, episodes=0), self._store(run) as store:
             execution.check_same(plan, store)
             drive.before = drive.done = len(store.keys())
@@ -491,19 +493,19 @@ class Runs:
                 faults = execution.drive(plan, store, drive.engine, folder / OUTPUTS, progress)
             drive.done = len(store.keys())
         with contextlib.suppress(OSError):
-            (folder / OUTPUTS).rmdir()  # where no output was asked for
+            (folder / OUTPUTS).rmdir()  # if no output was requested
         self._clerks.call("finish", run, plan)
         return [f"{fault.key}: {fault.error}" for fault in faults]
 
 
 def _short(text: str) -> str:
-    """Of a traceback the first and the last line."""
+    """The text; of a traceback only the first and the last line."""
     lines = text.strip().splitlines()
     return text if len(lines) < 3 else f"{lines[0]} {lines[-1]}"
 
 
 def shown(error: BadInput, settings: Settings) -> BadInput:
-    """The error without the server's own folders, and the field as the request has it."""
+    """The error without the server's folders, and with the field's name in requests."""
     ours = (settings.uploads, settings.runs, settings.data, sumo_scenarios.ROOT)
 
     def clean(text: object) -> Any:

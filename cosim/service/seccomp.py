@@ -1,4 +1,4 @@
-"""Linux's seccomp: the system calls that a simulation needs, and no others, for every thread of this process.
+"""Linux's seccomp: allows only the system calls that a simulation needs, for all threads of this process.
 
 Needs no privilege (https://docs.kernel.org/userspace-api/seccomp_filter.html). A refused call answers EPERM;
 a call newer than `_NEW` answers ENOSYS, on which the C library falls back to an older one.
@@ -14,8 +14,8 @@ from collections.abc import Iterator
 
 from cosim.errors import CosimError
 
-# name, number on x86_64, on aarch64 (asm/unistd_64.h, asm-generic/unistd.h). Not among them: sockets,
-# programs, processes, changes of owners, modes, times and attributes, links, devices, mounts, others' memory.
+# name, number on x86_64, on aarch64 (asm/unistd_64.h, asm-generic/unistd.h). Not included: sockets, programs,
+# processes, changes of owners, modes, times and attributes, links, devices, mounts, others' memory.
 _CALLS = """
 read 0 63, write 1 64, readv 19 65, writev 20 66, pread64 17 67, pwrite64 18 68, preadv 295 69,
 pwritev 296 70, close 3 57, close_range 436 436, lseek 8 62, fsync 74 82, fdatasync 75 83,
@@ -45,7 +45,7 @@ clone 56 220, kill 62 129, tgkill 234 131, prlimit64 302 261, sched_setaffinity 
 fcntl 72 25, ioctl 16 29, prctl 157 167
 """
 _ARCHITECTURES = {"x86_64": (0xC000003E, 1), "aarch64": (0xC00000B7, 2)}  # linux/audit.h, column of _CALLS
-_NEW = 424  # from here on the numbers are the same on both
+_NEW = 424  # from this number on, both architectures have equal numbers
 
 _OWN = -1  # stands for this process's id
 # Calls with one argument that must be one of these: (its place, values)
@@ -54,7 +54,7 @@ _ONLY = {
     "tgkill": (0, (_OWN,)),
     "prlimit64": (0, (0, _OWN)),
     "sched_setaffinity": (0, (0,)),
-    # F_DUPFD to F_SETLKW, F_OFD_*, F_DUPFD_CLOEXEC: nobody else is sent signals
+    # F_DUPFD to F_SETLKW, F_OFD_*, F_DUPFD_CLOEXEC: without signals to other processes
     "fcntl": (1, (0, 1, 2, 3, 4, 5, 6, 7, 36, 37, 38, 1030)),
     # TCGETS, TIOCGWINSZ, FIONREAD, FIONBIO, FIONCLEX, FIOCLEX
     "ioctl": (1, (0x5401, 0x5413, 0x541B, 0x5421, 0x5450, 0x5451)),
@@ -81,16 +81,16 @@ class _Program(ctypes.Structure):
 
 
 def available() -> bool:
-    """Whether this kernel filters system calls, and we know its numbers."""
+    """Whether this kernel filters system calls, and its numbers are known here."""
     if sys.platform != "linux" or platform.machine() not in _ARCHITECTURES:
         return False
     return int(ctypes.CDLL(None).prctl(_PRCTL_GET_SECCOMP, 0, 0, 0, 0)) >= 0
 
 
 def restrict() -> None:
-    """From now on this process may do no more than `_CALLS`. Raises CosimError without seccomp."""
+    """Restrict this process to `_CALLS` from now on. Raises CosimError without seccomp."""
     if not available():
-        raise CosimError("this kernel has no seccomp that we know: uploads cannot be driven on it")
+        raise CosimError("this kernel has no known seccomp: uploads cannot be driven on it")
     machine = platform.machine()
     lines = [_Instruction(*line) for line in _filter(*_ARCHITECTURES[machine])]
     program = _Program(len(lines), (_Instruction * len(lines))(*lines))
@@ -120,7 +120,7 @@ def _filter(architecture: int, column: int) -> Iterator[tuple[int, int, int, int
 
 
 def _conditions(name: str) -> Iterator[tuple[int, int, int, int]]:
-    """What is looked at before the call may be made: lines that end in EPERM, or just behind themselves."""
+    """Instructions that check a call's arguments: they return EPERM, or continue after the last one."""
     if name == "clone":
         yield _LOAD, 0, 0, _ARGUMENTS
         yield _BITS, 1, 0, _THREAD

@@ -15,7 +15,7 @@ from cosim.service.confined import lacking
 from cosim.service.monitor import log_json
 from cosim.service.settings import TOKEN, DataFolder, Settings
 
-MESSAGE = 4096  # bytes of what a page asks for
+MESSAGE = 4096  # bytes of a page's request over the WebSocket
 KEEP_ALIVE = 120  # s: a driver may think for a while between two decisions
 HEAD, HEAD_TIME = 1 << 16, 30.0  # bytes, s
 
@@ -27,17 +27,17 @@ class Bounded(HttpToolsProtocol):
     _timer: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """A head may begin."""
+        """Start the timer of the first head."""
         super().connection_made(transport)
         self._expect()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """None can come."""
+        """Stop the timer."""
         self._arrived()
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Some of a head, or of what comes after it."""
+        """Count the bytes of a head."""
         super().data_received(data)
         if self._timer is not None:
             self._left -= len(data)
@@ -45,12 +45,12 @@ class Bounded(HttpToolsProtocol):
                 self.transport.close()
 
     def on_message_begin(self) -> None:
-        """The parser's: a head begins."""
+        """Called by the parser when a head begins."""
         super().on_message_begin()
         self._expect()
 
     def on_headers_complete(self) -> None:
-        """The parser's: it is whole."""
+        """Called by the parser when a head is complete."""
         self._arrived()
         super().on_headers_complete()
 
@@ -66,7 +66,7 @@ class Bounded(HttpToolsProtocol):
 
 
 def serve(data: str, *, host: str, port: int, said: TextIO, **settings: Any) -> int:
-    """Serve until Ctrl-C or SIGTERM; where to is told on `said` before.
+    """Serve until Ctrl-C or SIGTERM; prints the address on `said` before.
 
     Raises BadInput: folder, database or address cannot be used.
     """
@@ -79,12 +79,12 @@ def serve(data: str, *, host: str, port: int, said: TextIO, **settings: Any) -> 
             log_json()
             shown = f"[{host}]" if ":" in host else host
             asks = (
-                "no token is asked for"
+                "no token is needed"
                 if token is None
                 else f"the token is in {file or 'the variable ' + TOKEN}"
             )
             if problem := lacking():
-                print(f"cosim: no uploads are taken: {problem}", file=said, flush=True)
+                print(f"cosim: no uploads are accepted: {problem}", file=said, flush=True)
             print(f"cosim: http://{shown}:{port} ({asks})", file=said, flush=True)
             config = uvicorn.Config(
                 app,
@@ -96,18 +96,18 @@ def serve(data: str, *, host: str, port: int, said: TextIO, **settings: Any) -> 
                 timeout_graceful_shutdown=5,
                 ws_max_size=MESSAGE,
             )
-            with contextlib.suppress(KeyboardInterrupt):  # raised again by uvicorn once it has ended in order
+            with contextlib.suppress(KeyboardInterrupt):  # raised again by uvicorn after the shutdown
                 uvicorn.Server(config).run(sockets=[listening])
     return 0
 
 
 def _bind(host: str, port: int) -> socket.socket:
-    """Raises BadInput for an unknown address, or one in use."""
+    """The listening socket. Raises BadInput for an unknown address, or an address in use."""
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
     except OSError as error:
         raise BadInput(f"no such address: {error.strerror}", field="--host", value=host) from None
-    # asyncio sends at once (TCP_NODELAY) only where the protocol is named; else an answer's body waits 40 ms
+    # asyncio sets TCP_NODELAY only for a named protocol; otherwise an answer's body is delayed by 40 ms
     listening = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:

@@ -42,10 +42,10 @@ log = logging.getLogger("cosim.service")
 
 
 class Served(Session):
-    """A session whose process's answers can be passed on as they are.
+    """A session that can pass on the answers of its process unchanged.
 
-    `passes_on` is set for an episode: then nobody observes here, since what is unpacked here costs a
-    millisecond or two and is kept by the other side.
+    `passes_on` is set per episode. The server then does not unpack observations, which would take a
+    millisecond or two; the client keeps the history.
     """
 
     reply: Reply
@@ -60,7 +60,7 @@ class Served(Session):
     def check_observed(self) -> None:
         """Raises Conflict in an episode whose observations are passed on."""
         if self.passes_on:
-            raise Conflict("this episode's observations go to the client that began it: reset first")
+            raise Conflict("only the client that began this episode gets observations: reset first")
 
     def _take(self, reply: Reply) -> None:
         self.reply = reply
@@ -111,7 +111,7 @@ class Open:
 
     @contextlib.contextmanager
     def asked(self) -> Iterator[Served]:
-        """`using` it for one of at most `CALLS` requests. Raises Unavailable."""
+        """`using` the session for one of at most `CALLS` requests. Raises Unavailable."""
         if not self._calls.acquire(blocking=False):
             raise Unavailable(f"{CALLS} requests of session {self.id} wait already: try again later")
         try:
@@ -124,7 +124,7 @@ class Open:
     def using(self) -> Iterator[Served]:
         """The session, for one request at a time.
 
-        Raises NotFound when it has ended meanwhile, Conflict when the simulation failed: a reset begins anew.
+        Raises NotFound when the session has ended, Conflict when the simulation failed: a reset restarts it.
         """
         with self._lock:
             if self.ended:
@@ -132,24 +132,24 @@ class Open:
             try:
                 yield self.session
             except SimulationError as error:
-                raise Conflict(f"the simulation failed, reset begins anew: {error}") from None
+                raise Conflict(f"the simulation failed, a reset restarts it: {error}") from None
             finally:
                 self._used = time.monotonic()
 
     @property
     def idle_for(self) -> float:
-        """s since its last request ended; 0 during one."""
+        """s since the last request ended; 0 during a request."""
         return 0.0 if self._lock.locked() else time.monotonic() - self._used
 
     def act(self, actions: Mapping[str, Any], see: Sequence[str] | None) -> StepResult:
-        """One decision; the caller is `using` it."""
+        """Carry out one decision; the caller is `using` the session."""
         began = time.perf_counter()
         result = self.session.act(actions, see=see)
         self._took(time.perf_counter() - began)
         return result
 
     def close(self, reason: str = "closed") -> None:
-        """End it: the simulation and its process."""
+        """End the simulation and its process."""
         with self._lock:
             if not self.ended:
                 self.ended = True
@@ -181,7 +181,7 @@ class Open:
 
 
 class Sessions:
-    """Those that are open. `took` is told the s of every decision."""
+    """The open sessions. `took` is called with the duration of every decision, s."""
 
     def __init__(
         self, settings: Settings, clerks: Clerks, warmth: Warmth, took: Callable[[float], None]
@@ -194,23 +194,23 @@ class Sessions:
         self._reaper = threading.Thread(target=self._reap, name="cosim-idle-sessions", daemon=True)
 
     def start(self) -> None:
-        """End idle ones from now on."""
+        """End idle sessions from now on."""
         self._reaper.start()
 
     def close(self) -> None:
-        """End all."""
+        """End all sessions."""
         self._closed.set()
         for one in [*self._open.values()]:
             self.end(one.id)
 
     @property
     def number(self) -> int:
-        """How many are open."""
+        """Number of open sessions."""
         return len(self._open)
 
     @property
     def watched(self) -> int:
-        """How many pages watch one."""
+        """Number of pages that watch a session."""
         return sum(one.live.number for one in self.all())
 
     def open(
@@ -224,7 +224,7 @@ class Sessions:
         reward: str = "p",
         idle: float | None = None,
     ) -> Open:
-        """Open one. Raises BadInput, Unavailable when as many are open as the server takes."""
+        """Open a session. Raises BadInput, Unavailable at the limit of open sessions."""
         limits = self._settings.limits
         with self._lock:
             if len(self._open) + self._opening >= limits.sessions:
@@ -244,22 +244,22 @@ class Sessions:
         return found
 
     def that_uses(self, upload: str) -> str | None:
-        """A session that is open on this upload."""
+        """The id of an open session that uses this upload; None without one."""
         return next((one.id for one in self.all() if upload in one.uploads), None)
 
     def get(self, session: str) -> Open:
-        """One of them. Raises NotFound."""
+        """The open session of this id. Raises NotFound."""
         found = self._open.get(session) if ID.fullmatch(session) else None
         if found is None:
             raise NotFound(f"no session {session!r} is open")
         return found
 
     def all(self) -> list[Open]:
-        """Those that are open, the oldest first."""
+        """The open sessions, the oldest first."""
         return [*self._open.values()]
 
     def end(self, session: str, reason: str = "closed") -> None:
-        """Close one. Raises NotFound."""
+        """Close a session. Raises NotFound."""
         one = self.get(session)
         self._open.pop(session, None)
         one.close(reason)
@@ -300,8 +300,8 @@ class Sessions:
     def _reap(self) -> None:
         while not self._closed.wait(LOOKS):
             for one in [*self._open.values()]:
-                # a page that is open counts for as long as the server takes
+                # a session with an open page gets the server's limit
                 if one.idle_for > (self._settings.limits.idle if one.live.number else one.idle):
                     log.info("session was idle", extra={"session": one.id, "seconds": one.idle})
                     with contextlib.suppress(NotFound):
-                        self.end(one.id, "nobody used it")
+                        self.end(one.id, "it was idle")

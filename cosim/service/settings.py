@@ -11,8 +11,8 @@ from pathlib import Path
 from cosim.errors import BadInput
 from cosim.files import cannot, lock, prepare_folder, whole
 
-TOKEN = "COSIM_TOKEN"  # the variable that names the bearer token
-DATABASE = "COSIM_DATABASE_URL"  # the variable that names the database
+TOKEN = "COSIM_TOKEN"  # the variable with the bearer token
+DATABASE = "COSIM_DATABASE_URL"  # the variable with the database's URL
 MB = 1 << 20
 
 
@@ -22,33 +22,33 @@ class Limits:
 
     body: int = 1 * MB  # of a request, uploads apart
     upload: int = 64 * MB  # of an archive
-    unpacked: int = 256 * MB  # of what is in it
-    files: int = 200  # in it
+    unpacked: int = 256 * MB  # of an archive's content
+    files: int = 200  # in an archive
     uploads: int = 1000  # kept
     cells: int = 1000  # of a run
     simulated: float = 86_400.0  # of an episode, warm-up included
     queued: int = 1000  # runs that wait
-    waiting: int = 16  # requests that wait for each kind of work that takes long
+    waiting: int = 16  # requests that wait, for each kind of long work
     sessions: int = 16  # open at once
     idle: float = 600.0  # until a session ends by itself
     check: float = 120.0  # to check a request
     memory: int = 8192 * MB  # address space of a process that simulates
-    file: int = 512 * MB  # that such a process writes
-    disk: int = 8192 * MB  # that all processes of a run, a session or a check with uploads write
-    free: int = 256 * MB  # that they leave on the disk; with less a server is not ready
+    file: int = 512 * MB  # written by such a process
+    disk: int = 8192 * MB  # written by all processes of a run, a session or a check with uploads
+    free: int = 256 * MB  # left on the disk; with less a server is not ready
     tasks: int = 1024  # threads that a confined process adds to those of its user
     cpu: float = 900.0  # processor time of one episode, or between two resets of a session
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """A server's. `data` is absolute."""
+    """The settings of a server. `data` is absolute."""
 
     data: Path
     host: str = "127.0.0.1"
     port: int = 8000
     database: str | None = None  # URL; None: SQLite in `data`
-    workers: int | None = None  # processes of runs; None: one a core
+    workers: int | None = None  # processes of runs; None: one per core
     engine: str = "local"
     ray_address: str | None = None
     token: str | None = None  # None: no authorisation
@@ -56,12 +56,12 @@ class Settings:
 
     @property
     def runs(self) -> Path:
-        """A folder a run."""
+        """The folder of runs, with a folder per run."""
         return self.data / "runs"
 
     @property
     def uploads(self) -> Path:
-        """A folder an upload."""
+        """The folder of uploads, with a folder per upload."""
         return self.data / "uploads"
 
     @property
@@ -76,9 +76,9 @@ class Settings:
 
 
 def database(url: str | None, file: str | None) -> str | None:
-    """The database's URL: given, or what `file` holds, or else what the variable `DATABASE` does.
+    """The database's URL: `url`, or else the content of `file`, or else of the variable `DATABASE`.
 
-    The variable is taken out of the environment, so that no process of the server's inherits it.
+    The variable is removed from the environment, so that the server's processes do not inherit it.
 
     Raises BadInput.
     """
@@ -90,12 +90,12 @@ def database(url: str | None, file: str | None) -> str | None:
     with cannot("read", field="--database-file", value=file):
         found = Path(file).read_text("utf-8", "replace").strip()
     if not found:
-        raise BadInput("holds no database URL", field="--database-file", value=file)
+        raise BadInput("contains no database URL", field="--database-file", value=file)
     return found
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches a server that is bound to `host`."""
+    """Whether only this machine can reach a server bound to `host`."""
     try:
         return ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:
@@ -103,9 +103,9 @@ def is_loopback(host: str) -> bool:
 
 
 class DataFolder(contextlib.AbstractContextManager["DataFolder"]):
-    """The server's folder, made and locked until `close`.
+    """The server's folder, created and locked until `close`.
 
-    Raises BadInput: it cannot be made or written, or another server works in it.
+    Raises BadInput: the folder cannot be created or written, or another server uses it.
     """
 
     def __init__(self, path: str) -> None:
@@ -116,10 +116,10 @@ class DataFolder(contextlib.AbstractContextManager["DataFolder"]):
             (self.path / name).mkdir(exist_ok=True)
 
     def token(self, host: str) -> tuple[str | None, Path | None]:
-        """The bearer token, and the file that holds it where this server made one.
+        """The bearer token (None on loopback), and its file (None for the variable `TOKEN`).
 
-        It is the variable `TOKEN`, or else, unless `host` is loopback, kept in the folder for its owner's
-        eyes and made at the first start.
+        Without the variable, and unless `host` is loopback, the token is created at the first start, in a
+        file that only its owner can read.
         """
         if given := os.environ.get(TOKEN, "").strip():
             return given, None
@@ -133,7 +133,7 @@ class DataFolder(contextlib.AbstractContextManager["DataFolder"]):
         return file.read_text().strip(), file
 
     def close(self) -> None:
-        """Give up the lock."""
+        """Release the lock."""
         os.close(self._lock)
 
     def __exit__(self, *error: object) -> None:

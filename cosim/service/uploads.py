@@ -28,7 +28,7 @@ log = logging.getLogger("cosim.service")
 
 @dataclass(frozen=True, slots=True)
 class Upload:
-    """One of them; `file` is its .sumocfg or its weights, below its own folder."""
+    """One upload; `file` is its .sumocfg or its weights, relative to its folder."""
 
     id: str
     kind: str  # scenario or policy
@@ -37,11 +37,11 @@ class Upload:
     file: str
     files: list[str]
     bytes: int  # unpacked
-    about: dict[str, Any]  # what the examination found
+    about: dict[str, Any]  # results of the examination
 
 
 class Uploads:
-    """Those that the server keeps, a folder each."""
+    """The stored uploads, a folder each."""
 
     def __init__(self, settings: Settings, processes: Processes) -> None:
         self._settings, self._processes = settings, processes
@@ -49,10 +49,10 @@ class Uploads:
             shutil.rmtree(part, ignore_errors=True)
 
     def add(self, archive: Path, kind: str, name: str) -> Upload:
-        """Unpack, check and keep an archive. Raises BadInput, Unavailable when there are too many."""
+        """Unpack, check and store an archive. Raises BadInput, Unavailable when there are too many."""
         settings, limits = self._settings, self._settings.limits
         if len(self.all()) >= limits.uploads:
-            raise Unavailable(f"{limits.uploads} uploads are kept: delete one first")
+            raise Unavailable(f"{limits.uploads} uploads are stored: delete one first")
         upload = new_id()
         part = settings.uploads / f"{upload}.part"
         part.mkdir()
@@ -61,7 +61,7 @@ class Uploads:
                 main, about = self._taken(archive, part, kind)
                 sizes = _settled(part, limits)
             if main not in sizes:
-                raise BadInput("holds no such file", field="archive", value=main)
+                raise BadInput("contains no such file", field="archive", value=main)
             found = Upload(
                 id=upload,
                 kind=kind,
@@ -83,19 +83,19 @@ class Uploads:
         return found
 
     def all(self) -> list[Upload]:
-        """The newest first."""
+        """All uploads, the newest first."""
         found = [self._read(path) for path in self._settings.uploads.glob(f"*{ABOUT}")]
         return sorted(found, key=lambda upload: (upload.created, upload.id), reverse=True)
 
     def get(self, upload: str) -> Upload:
-        """One of them. Raises NotFound."""
+        """The upload of this id. Raises NotFound."""
         about = self._about(upload)
         if not ID.fullmatch(upload) or not about.is_file():
             raise NotFound(f"no upload {upload!r}")
         return self._read(about)
 
     def file(self, upload: str, kind: str) -> Path:
-        """Its .sumocfg (kind scenario) or its weights (kind policy). Raises BadInput."""
+        """The .sumocfg (kind scenario) or the weights (kind policy) of an upload. Raises BadInput."""
         try:
             found = self.get(upload)
         except NotFound as error:
@@ -105,7 +105,7 @@ class Uploads:
         return self._settings.uploads / upload / found.file
 
     def remove(self, upload: str) -> None:
-        """Forget one and its files. Raises NotFound."""
+        """Delete an upload and its files. Raises NotFound."""
         self.get(upload)
         self._about(upload).unlink()
         shutil.rmtree(self._settings.uploads / upload, ignore_errors=True)
@@ -113,9 +113,9 @@ class Uploads:
     # ---- inside ----
 
     def _taken(self, archive: Path, part: Path, kind: str) -> tuple[str, dict[str, Any]]:
-        """What a confined process unpacks into `part` and finds there; nothing of it is read here.
+        """Unpack and examine an archive in a confined process; returns its main file and a description.
 
-        Raises BadInput, also where that process ends or hangs.
+        Raises BadInput, also if that process crashes or hangs.
         """
         limit = self._settings.limits.check
         with room(self._settings, [archive], part) as confined:
@@ -124,12 +124,12 @@ class Uploads:
                 main, about = self._processes.ask("cosim-examiner", limit, examiner, "take", *files, kind)
                 return str(main), dict(about)
             except SimulationTimeout:
-                raise BadInput(f"takes more than {limit:g} s to look at", field="archive") from None
+                raise BadInput(f"takes more than {limit:g} s to examine", field="archive") from None
             except SimulationCrashed as error:
                 raise BadInput(f"ends the process that reads it: {error}", field="archive") from None
             except BadInput:
                 raise
-            except CosimError as error:  # a fault of ours that an upload has found
+            except CosimError as error:  # an internal error caused by an upload
                 log.exception("an upload could not be examined")
                 raise BadInput(f"cannot be read: {str(error).splitlines()[-1]}", field="archive") from None
 
@@ -143,7 +143,7 @@ class Uploads:
 
 @contextlib.contextmanager
 def _of_the_archive(folder: Path) -> Iterator[None]:
-    """Name files of the block's BadInput as the archive does."""
+    """Name files in the block's BadInput relative to the archive."""
     try:
         yield
     except BadInput as error:
@@ -157,9 +157,10 @@ def _of_the_archive(folder: Path) -> Iterator[None]:
 
 
 def _settled(folder: Path, limits: Limits) -> dict[str, int]:
-    """Name -> bytes of every file below `folder`; they belong to this process's user from now on.
+    """Name -> bytes of every file below `folder`; changes their owner to this process's user.
 
-    The writing process has ended. Raises BadInput for links, special files, or a size above the limit.
+    Call it after the writing process has ended. Raises BadInput for links, special files, or a size above
+    the limit.
     """
     found: dict[str, int] = {}
     for path, folders, names in os.walk(folder, onerror=_raise):
@@ -167,14 +168,14 @@ def _settled(folder: Path, limits: Limits) -> dict[str, int]:
             one = Path(path, name)
             about = one.lstat()
             if not (stat.S_ISDIR(about.st_mode) or (stat.S_ISREG(about.st_mode) and about.st_nlink == 1)):
-                raise BadInput("is no regular file", field="archive", value=name)
+                raise BadInput("is not a regular file", field="archive", value=name)
             os.chown(one, os.geteuid(), os.getegid())
             one.chmod(0o755 if name in folders else 0o644)
             if name in names:
                 found[str(one.relative_to(folder))] = about.st_size
     os.chown(folder, os.geteuid(), os.getegid())
     if len(found) > limits.files or sum(found.values()) > limits.unpacked:
-        raise BadInput("is more than was unpacked", field="archive")
+        raise BadInput("has more files or bytes than were unpacked", field="archive")
     return dict(sorted(found.items()))
 
 

@@ -19,7 +19,7 @@ _LAW = ("signal_distance", "stop_distance", "yield_distance", "crossing_distance
 
 
 def view(seen: View) -> dict[str, Any]:
-    """What one AV sees now: m, m/s, rad, s; others in its own frame (x ahead, y to the left)."""
+    """One AV's observation in m, m/s, rad and s; other vehicles in the AV's frame (x ahead, y left)."""
     rules, rows = seen.rules, np.round(seen.kinematics[-1].astype(np.float64), DECIMALS).tolist()
     columns = np.round(seen.age, DECIMALS).tolist(), seen.source.tolist(), seen.indicator.tolist()
     x, y, heading = seen.pose.tolist()
@@ -56,7 +56,7 @@ def view(seen: View) -> dict[str, Any]:
 
 
 def step(session: Session, result: StepResult | None) -> dict[str, Any]:
-    """What a reset (`result` None) or an act brought."""
+    """The result of a reset (`result` is None) or an act."""
     found: dict[str, Any] = {
         "seed": session.seed,
         "elapsed": session.elapsed,
@@ -104,7 +104,7 @@ def snapshot(now: Snapshot) -> dict[str, Any]:
 
 
 def to_json(document: Any) -> bytes:
-    """JSON as every parser reads it: what is not finite is null."""
+    """Standard JSON; numbers that are not finite become null."""
     try:
         return json.dumps(document, allow_nan=False, separators=(",", ":")).encode()
     except ValueError:
@@ -112,7 +112,7 @@ def to_json(document: Any) -> bytes:
 
 
 def _ahead(distance: float) -> float | None:
-    """m; null where there is none."""
+    """The distance in m; None if it is infinite."""
     return distance if math.isfinite(distance) else None
 
 

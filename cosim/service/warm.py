@@ -1,6 +1,6 @@
 """Compilation of the kernels at the server's start, so that no session waits for it.
 
-numba keeps what it compiled on disk, for the processor and version that it was compiled for.
+numba stores compiled kernels on disk, for one processor and version.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from cosim.types import COMPACT
 from cosim.workers.supervisor import Limits, Supervisor
 from cosim.workers.tasks import Progress, Task
 
-POLICY = "vfn-p"  # it calls every kernel there is
+POLICY = "vfn-p"  # calls every kernel
 DECISIONS = 10
 HEARTBEAT = 1800.0  # s for a session's start and decisions, compiled: half a minute on a quick machine
 log = logging.getLogger("cosim.service")
 
 
 class Warmth:
-    """`start` it once; `wait` until the kernels are there."""
+    """Call `start` once; `wait` returns when the kernels are compiled."""
 
     def __init__(self) -> None:
         self._done = threading.Event()
@@ -35,19 +35,19 @@ class Warmth:
         self._thread = threading.Thread(target=self._work, name="cosim-warm", daemon=True)
 
     def start(self) -> None:
-        """Compile from now on."""
+        """Start the compilation."""
         self._thread.start()
 
     def wait(self) -> None:
-        """Until they are compiled, or cannot be."""
+        """Wait until the kernels are compiled, or the compilation has failed."""
         self._done.wait()
 
     def problem(self) -> str | None:
-        """Why a session would wait now."""
+        """The reason why a session would wait now; None if it would not."""
         return None if self._done.is_set() else "kernels are being compiled"
 
     def close(self) -> None:
-        """Give up."""
+        """End the compilation."""
         self._closed = True
         if self._supervisor is not None:
             self._supervisor.kill()
@@ -67,12 +67,12 @@ class Warmth:
 
 
 class Warmer:
-    """Hosted in a process: begins sessions and looks at them, as a page does."""
+    """Hosted in a process: begins sessions and reads their scenes, as a page does."""
 
     def run(self, progress: Progress) -> None:
-        """A few decisions of every world with `POLICY`, and of every policy in one world.
+        """Drive a few decisions of every scenario with `POLICY`, and of every policy in one scenario.
 
-        Where the first of them compiles nothing, the kernels are there.
+        If the first session compiles nothing, all kernels are compiled.
         """
         compiled: list[None] = []
         on_compilation(lambda: compiled.append(None))
@@ -91,4 +91,4 @@ class Warmer:
                 return
 
     def close(self) -> None:
-        """The process ends."""
+        """Nothing to close."""

@@ -1,7 +1,7 @@
 """The simulation's side of watching a session: JSON for the page, computed only while viewers exist.
 
-A `Scene` comes first; then every decision brings what stays (`lasting`: words, vehicles, events) and a step,
-which may be lost on its way: it holds whole positions, no differences.
+A `Scene` comes first. Then every decision brings persistent data (`lasting`: words, vehicles, events) and a
+step. A step may be lost on its way, so it has whole positions instead of differences.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Notes(Hook):
         self.picture: Picture | None = None
 
     def on_start(self, episode: Episode) -> None:
-        """A new episode: errors of the warm-up that go on are of it."""
+        """Begin an episode; errors of the warm-up that still last belong to it."""
         now = episode.snapshot.time
         self.interventions: list[Intervention] = []
         self.errors: list[HumanError] = [
@@ -58,7 +58,7 @@ class Notes(Hook):
         self.picture = None
 
     def on_step(self, episode: Episode, step: Step) -> None:
-        """One decision."""
+        """Note the events of one decision."""
         events = step.events
         self.interventions += events.interventions
         self.errors += events.errors
@@ -101,7 +101,7 @@ class Picture:
         return Scene(_text(self._road.document), _text(head), self.told(), self.step)
 
     def draw(self, episode: Episode, step: Step) -> None:
-        """One decision: its frames, what was decided before them, and what was expected then."""
+        """Draw one decision: its choices, predictions and beliefs, and the frames after it."""
         frames = [self._frame(frame) for frame in step.frames]
         outcomes = zip(step.commands, step.receipts, strict=True)
         choices = {
@@ -128,7 +128,7 @@ class Picture:
         self.step = _text(found)
 
     def told(self) -> list[str]:
-        """New persistent data."""
+        """New persistent data, each once."""
         found, self.lasting = self.lasting, []
         return found
 
@@ -144,7 +144,7 @@ class Picture:
     def _frame(self, s: Snapshot) -> list[Any]:
         """[ms, vehicles, x cm, y cm, heading mrad, speed cm/s, acceleration cm/s2, lane, signals]; signals as
         one text."""
-        self._meet(s)
+        self._number(s)
         numbers = [self._names.vehicles[name] for name in s.ids]
         columns = (s.x, 100.0), (s.y, 100.0), (s.heading, 1000.0), (s.speed, 100.0), (s.accel, 100.0)
         whole = [np.rint(np.nan_to_num(c * unit)).astype(np.int64).tolist() for c, unit in columns]
@@ -152,14 +152,14 @@ class Picture:
         signals = "".join(chr(s.signals[k]) for k in self._road.signals)
         return [ms(s.time), numbers, *whole, lanes, signals]
 
-    def _meet(self, s: Snapshot) -> None:
-        """Number new vehicles."""
+    def _number(self, s: Snapshot) -> None:
+        """Give numbers to new vehicles."""
         known = self._names.vehicles
         if not (new := [k for k, name in enumerate(s.ids) if name not in known]):
             return
         classes: Mapping[str, str] = getattr(
             self._simulator, "driver_classes", dict
-        )()  # SUMO's simulator alone knows them
+        )()  # known only to SUMO's simulator
         for k in new:
             known[s.ids[k]] = len(known)
             driver = classes.get(s.ids[k], AS_IS) if s.kind[k] == Kind.HV else ""
@@ -169,7 +169,7 @@ class Picture:
             self.lasting.append(_text(["vehicles", row]))
 
     def _note(self, episode: Episode) -> None:
-        """Events that are new, after the words that they and the step's choices use."""
+        """Add new events to `lasting`, after the words that they and the step's choices use."""
         names, notes = self._names, self._notes
         found: list[Any] = []
         events: dict[str, Sequence[Any]] = {
@@ -214,7 +214,7 @@ class WatchedHost(SessionHost):
             self._explainer.asked, self._explainer.uses = av, ()
 
     def drawn(self) -> tuple[list[str], str]:
-        """What the last decision brought: what stays, and its step. After `scene` in the same episode."""
+        """Persistent data and step of the last decision. Call it after `scene` in the same episode."""
         picture = self._notes.picture
         assert picture is not None
         return picture.told(), picture.step
@@ -226,8 +226,11 @@ class WatchedHost(SessionHost):
 
 
 def tally(ended: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Of whole episodes, one a seed: how many, shares of crashes (C%) and missions with 95 % intervals, mean
-    DT in m, least time to collision in s."""
+    """Figures of whole episodes, one per seed.
+
+    Number of episodes, shares of crashes (C%) and missions with 95 % intervals, mean distance in m, and
+    smallest time to collision in s.
+    """
     if not ended:
         return {"episodes": 0}
     from cosim.report.statistics import share  # scipy.stats: at the end of the first episode

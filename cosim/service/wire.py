@@ -1,6 +1,6 @@
 """A session's answers as bytes for cosim's client: arrays as safetensors, the rest as JSON metadata.
 
-Nothing is ever unpickled: a server is trusted with what it says, not with the client's process.
+Nothing is unpickled, so a server cannot run code in the client.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from cosim.rewards import RewardTerms
 from cosim.scenario.options import COLUMNS
 from cosim.types import IDENTITY, Collision, Due, EpisodeResult, Events, Metric, Receipt, Snapshot
 
-MEDIA = "application/vnd.cosim.step"  # what a client accepts that wants bytes
+MEDIA = "application/vnd.cosim.step"  # accepted by clients that want bytes
 _DOCUMENT = "document"  # the key of the metadata
 Arrays = Mapping[str, npt.NDArray[Any]]
 _PACKED = tuple(name for name in Packed._fields if name not in ("avs", "newcomers", "ids"))
@@ -31,19 +31,19 @@ _EVENTS = typing.get_type_hints(Events)
 
 
 def pack(arrays: Arrays, document: Mapping[str, Any]) -> bytes:
-    """Arrays and a JSON document (infinities too) in one."""
+    """Arrays and a JSON document (infinities allowed) as bytes."""
     whole = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     return bytes(save_arrays(whole, {_DOCUMENT: json.dumps(document)}))
 
 
 def unpack(data: bytes) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
-    """The way back. Raises BadInput for anything else."""
+    """The arrays and document of `pack`. Raises BadInput for anything else."""
     try:
         size = int.from_bytes(data[:8], "little")
         document = json.loads(json.loads(data[8 : 8 + size])["__metadata__"][_DOCUMENT])
         return load_arrays(data), document
     except Exception as error:
-        raise BadInput(f"is no answer of a cosim server: {error}") from None
+        raise BadInput(f"is not an answer of a cosim server: {error}") from None
 
 
 def of_reply(reply: Reply) -> bytes:
@@ -64,7 +64,7 @@ def of_reply(reply: Reply) -> bytes:
 
 
 def to_reply(data: bytes) -> Reply:
-    """The way back."""
+    """The reply of `of_reply`."""
     arrays, found = unpack(data)
     packed = Packed(
         avs=tuple(found["avs"]),
@@ -84,7 +84,7 @@ def to_reply(data: bytes) -> Reply:
 
 
 def to_events(found: Mapping[str, Any]) -> Events:
-    """Events of their JSON document."""
+    """Events from their JSON document."""
     values = {}
     for name, hint in _EVENTS.items():
         kind = typing.get_args(hint)[0]
@@ -96,7 +96,7 @@ def to_events(found: Mapping[str, Any]) -> Events:
 
 
 def of_snapshot(snapshot: Snapshot) -> bytes:
-    """Every vehicle."""
+    """A snapshot with all vehicles."""
     values = {f.name: getattr(snapshot, f.name) for f in fields(Snapshot)}
     arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
     names = ("time", "ids", "waiting")
@@ -105,7 +105,7 @@ def of_snapshot(snapshot: Snapshot) -> bytes:
 
 
 def to_snapshot(data: bytes) -> Snapshot:
-    """The way back."""
+    """The snapshot of `of_snapshot`."""
     arrays, found = unpack(data)
     waiting = found["waiting"] and {name: Due(*due) for name, due in found["waiting"].items()}
     about: dict[str, Any] = {"time": found["time"], "ids": tuple(found["ids"]), "waiting": waiting}
@@ -114,7 +114,7 @@ def to_snapshot(data: bytes) -> Snapshot:
 
 
 def to_result(document: Mapping[str, Any]) -> EpisodeResult:
-    """The result whose `EpisodeResult.document` this is."""
+    """The result from its `EpisodeResult.document`."""
     units, better = document["units"], document["better"]
     return EpisodeResult(
         **{name: document[name] for name in IDENTITY},

@@ -130,5 +130,5 @@ def youngest_child(pid: int) -> int:
 def test_no_server_is_one_sentence() -> None:
     with pytest.raises(BadInput, match="no server answers"):
         client.open("http://127.0.0.1:1", "merge")
-    with pytest.raises(BadInput, match="is no http://"):
+    with pytest.raises(BadInput, match="http://HOST:PORT is needed"):
         client.open("merge", "merge")

@@ -229,7 +229,7 @@ def test_blocking_work_waits_in_a_bounded_queue_and_holds_up_nothing_else(
     assert sorted({answer.status_code for answer in answers}) == [200, 429]
     refused = next(answer for answer in answers if answer.status_code == 429)
     assert int(refused.headers["retry-after"]) > 0
-    assert "18 estimates are asked for already" in refused.json()["problem"]
+    assert "18 estimates are requested already" in refused.json()["problem"]
 
 
 def test_every_route_that_blocks_has_a_queue_of_its_own(application: FastAPI) -> None:

@@ -167,7 +167,7 @@ def test_a_class_a_factory_and_a_function_of_ones_own_drive(code: Path, tmp_path
         ("Fails", "Fails: OSError: no model file"),
         ("Nothing", "Nothing: a policy needs observation, reset, decide (cosim.types.Policy)"),
         ("number", "--policy='number': no class or function of this name"),
-        ("Hold", "--policy='Hold': nothing to call of this name, did you mean 'Holds'?"),
+        ("Hold", "--policy='Hold': no class or function of this name, did you mean 'Holds'?"),
     ],
 )
 def test_a_mistake_in_it_is_one_line_that_names_its_file(

@@ -1,14 +1,13 @@
 #!/usr/bin/env bash
 # Builds the image, with a Docker engine or without: `docker/build.sh [runtime|test]`.
 #
-# Without one, buildah builds on a Debian that debootstrap makes (once; it stays in the local store), and the
-# build finds packages wherever pip finds them here: pip's own files and variables (PIP_CONFIG_FILE,
-# PIP_FIND_LINKS, PIP_CERT, ...) count, and the folders that they name are mounted. Variables, beside those of
-# engine.sh:
+# Without an engine, buildah builds on a Debian from debootstrap (made once and kept in the local store). The
+# build uses this machine's pip settings: pip's files and variables (PIP_CONFIG_FILE, PIP_FIND_LINKS,
+# PIP_CERT, ...), and the folders in them, which are mounted. Variables, besides those of engine.sh:
 #
 #   BASE     the image to start from (default: debian:bookworm-slim, or made by debootstrap)
 #   EXTRAS   extras of pyproject.toml to put in, with commas between (default: service,postgresql)
-#   PIP_INDEX_URL, PIP_EXTRA_INDEX_URL   all pip settings that a Docker engine gets, for it mounts nothing
+#   PIP_INDEX_URL, PIP_EXTRA_INDEX_URL   the only pip settings for a Docker engine, which mounts nothing
 set -euo pipefail
 cd "$(dirname "$0")/.."
 . docker/engine.sh
@@ -55,7 +54,7 @@ else
     python3 docker/host_pip.py "$lent" >"$lent/mounts"
     while read -r source inside; do args+=(--volume "$source:$inside:ro"); done <"$lent/mounts"
     args+=(--volume "$lent:/run/host-pip:ro" --build-arg PIP_CONFIG_FILE=/run/host-pip/pip.conf)
-    # chroot: no runtime, no namespaces of its own, so that it builds inside a container or a small machine too.
+    # chroot: without a runtime or own namespaces, so that the build also works inside a container.
     buildah bud --isolation chroot --network host --layers "${args[@]}" "${build_args[@]}" .
 fi
 size=$("${engine[@]}" image inspect --format '{{.Size}}' "$tag")

@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# Rehearses a Ray cluster of two machines as two containers: `docker/cluster.sh [RESULTS]`.
+# Tests a Ray cluster of two machines as two containers: `docker/cluster.sh [RESULTS]`.
 #
-# A head and a worker on a network of their own, with a token; the worker is killed in mid-run. Passes when every
-# episode is there and drove to the last bit as with the local engine. Wants an image with Ray in it:
-# EXTRAS=ray IMAGE=cosim:ray docker/build.sh. The same commands, one a machine, are a real cluster
-# (docs/guides/container.md); the variables are those of engine.sh.
+# A head and a worker on their own network, with a token; the worker is killed during the run. Passes if every
+# episode was driven with the same trace hash as with the local engine. Needs an image with Ray:
+# EXTRAS=ray IMAGE=cosim:ray docker/build.sh. The same commands on separate machines make a real cluster
+# (docs/guides/container.md). Variables as in engine.sh.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 IMAGE=${IMAGE:-cosim:ray}
@@ -27,7 +27,7 @@ clean() {
 trap clean EXIT
 "${engine[@]}" network create "$name" >/dev/null
 
-# Options of every node; a link that is cut without notice is given up after 15 s instead of two minutes.
+# Options of every node: a lost connection is noticed after 15 s instead of two minutes.
 node_options=(--env RAY_AUTH_MODE=token --env RAY_AUTH_TOKEN_PATH=/run/ray-token --volume "$token:/run/ray-token:ro"
     --env RAY_grpc_client_keepalive_time_ms=2000 --env RAY_grpc_client_keepalive_timeout_ms=2000
     --env RAY_grpc_keepalive_time_ms=2000 --env RAY_grpc_keepalive_timeout_ms=2000
@@ -68,7 +68,7 @@ while kill -0 "$driver" 2>/dev/null; do
     sleep 0.2
 done
 wait "$driver" || { echo "the driver failed"; tail -n 20 "$results/ray.log"; exit 1; }
-[ "$killed" = yes ] || { echo "over before a node was lost: nothing was tried"; exit 1; }
+[ "$killed" = yes ] || { echo "the run ended before the worker was killed"; exit 1; }
 in_head cosim evaluate "${matrix[@]}" --workers 2 --out /results/local 2>/dev/null
 in_head python -c '
 import pyarrow.parquet as parquet

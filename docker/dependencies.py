@@ -1,6 +1,6 @@
-"""Prints what pyproject.toml asks for, without cosim itself: `dependencies.py [EXTRA,EXTRA...]`.
+"""Prints the requirements of pyproject.toml, without cosim itself: `dependencies.py [EXTRA,EXTRA...]`.
 
-An image installs this list in a layer of its own, which a change of our code leaves alone.
+An image installs this list in its own layer, which does not change with cosim's code.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from pathlib import Path
 
 
 def dependencies(project: dict, extras: list[str]) -> list[str]:
-    """The requirements of `project` and its `extras`; an extra that names others (`NAME[a,b]`) is unfolded.
+    """The requirements of `project` and its `extras`; extras of extras (`NAME[a,b]`) are resolved.
 
-    Raises KeyError for an extra that the project does not have.
+    Raises KeyError for an unknown extra.
     """
     found = list(project["dependencies"])
     waiting = list(extras)

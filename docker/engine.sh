@@ -1,5 +1,5 @@
 # shellcheck shell=bash disable=SC2034
-# Sourced by build.sh and smoke.sh: which container engine there is, and the options it needs.
+# Sourced by build.sh, smoke.sh and cluster.sh: chooses the container engine and its options.
 #
 #   ENGINE      docker or podman (default: docker if an engine answers, else podman)
 #   IMAGE       the tag to build and to run (default: cosim:ci)
@@ -24,11 +24,11 @@ choose_engine() {
     fi
     engine=("$ENGINE")
     [ "$ENGINE" = podman ] || return 0
-    # crun refuses a machine that has both kinds of cgroups mounted; runc does not.
+    # crun does not work with both versions of cgroups mounted; runc does.
     if [ -d /sys/fs/cgroup/unified ] && command -v runc >/dev/null; then
         engine+=(--runtime runc)
     fi
-    # podman asks for a million open files by default, which runc refuses where this shell may not have them.
+    # podman requests a million open files by default; runc refuses that if the shell's limit is lower.
     run_args=(--ulimit "nofile=1024:$(at_most 4096 "$(ulimit -Hn)")"
         --ulimit "nproc=4096:$(at_most 4096 "$(ulimit -Hu)")" "${run_args[@]}")
 }

@@ -1,9 +1,8 @@
-"""Lends this machine's pip settings to an image's build: `host_pip.py FOLDER`.
+"""Passes this machine's pip settings to an image's build: `host_pip.py FOLDER`.
 
-Wherever pip finds packages for the person who builds (a folder of wheels, a company's index, a
-certificate bundle), the build shall find them too. FOLDER gets a pip.conf and the bundle; the folders that
-the settings name are printed, a line `SOURCE TARGET` each, to be mounted for the build. The pip.conf knows
-only the mounted places, so that no path of this machine ends in the image.
+The build uses the same sources of packages: folders of wheels, indexes, a certificate bundle. FOLDER gets a
+pip.conf and the bundle. The folders in the settings are printed for mounting, a line `SOURCE TARGET` each. The
+pip.conf has only mounted paths, so that no path of this machine gets into the image.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ PLAIN = ("no-index", "trusted-host", "timeout", "default-timeout", "proxy")
 
 
 def settings(listing: str) -> dict[str, str]:
-    """What `pip config list` printed, one value an option: the later and more special line holds."""
+    """The output of `pip config list` as option -> value; the more specific or later line wins."""
     found: dict[str, str] = {}
     rank = {"global": 0, "user": 1, "site": 2, "install": 3, ":env:": 4}
     lines = [line.partition("=") for line in listing.splitlines() if "=" in line]
@@ -48,13 +47,13 @@ def lend(found: dict[str, str]) -> tuple[str, dict[str, str], str | None]:
 
 
 def _moved(place: str, mounts: dict[str, str]) -> str:
-    """`place` as it is called inside the build; a folder is added to `mounts`, an address stays as it is."""
+    """`place` as seen inside the build: a folder is added to `mounts`, a URL is unchanged."""
     url = urlsplit(place)
     if url.scheme not in ("", "file"):
         return place
     folder = Path(unquote(url.path) if url.scheme else place)
     tail = ""
-    if folder.name == "simple":  # an index as PEP 503 lays it out: its links may lead beside it
+    if folder.name == "simple":  # an index as in PEP 503, whose links may point beside it
         folder, tail = folder.parent, "/simple"
     inside = mounts.setdefault(str(folder), f"{INSIDE}-{len(mounts)}")
     return f"{'file://' if url.scheme else ''}{inside}{tail}"

@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
-# Runs the built image as a CI would, locked up, from doctor to gate and server: `docker/smoke.sh [RESULTS]`.
+# Tests the built image under the restrictions of a CI, from doctor to gate and server: `docker/smoke.sh [RESULTS]`.
 #
-# No network, read-only root, no capability, no root user. Every exit code is asserted; what the container wrote
-# (rows, JUnit, reports, a log) stays in RESULTS (default: runs/smoke, which is emptied first). The variables
-# are those of engine.sh.
+# No network, read-only root, no capability, no root user. Every exit code is checked. The container's files
+# (rows, JUnit, reports, a log) stay in RESULTS (default: runs/smoke, which is emptied first). Variables as in
+# engine.sh.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 . docker/engine.sh
@@ -11,7 +11,7 @@ choose_engine
 
 results=$(realpath -m "${1:-runs/smoke}")
 if [ -e "$results" ] && [ -n "$(ls -A "$results")" ] && [ ! -e "$results/smoke.log" ]; then
-    echo "$results is not empty and no earlier smoke run's: name another folder" >&2
+    echo "$results is not empty and not from an earlier smoke test: name another folder" >&2
     exit 2
 fi
 rm -rf "$results"
@@ -22,7 +22,7 @@ cp -R docker/smoke/. "$mounted"
 cp sumo_scenarios/merge/net.net.xml "$mounted/mine.net.xml"
 chmod -R a+rX "$mounted"
 
-# Who writes the results: the person who runs this, but never root.
+# The results belong to the user who runs this script, but never to root.
 if [ "$(id -u)" = 0 ]; then
     user=(--user 10001:10001)
     chown 10001:10001 "$results"
@@ -64,16 +64,16 @@ all_began=$SECONDS
 echo "== $IMAGE with $ENGINE" | tee "$log"
 expect 0 "locked up, seen from inside" --entrypoint python -- /scenarios/isolation.py
 expect 0 "doctor" doctor
-expect 0 "run a built-in world" run merge --demand contested --json
+expect 0 "run a shipped scenario" run merge --demand contested --json
 cp "$out" "$results/run.json"
 expect 0 "run on a processor that the caches were not compiled for" \
     --env NUMBA_CPU_NAME=generic --env NUMBA_CPU_FEATURES= -- run merge --duration 2 --json
-expect 0 "evaluate a built-in world" evaluate --scenario merge --demand contested \
+expect 0 "evaluate a shipped scenario" evaluate --scenario merge --demand contested \
     --policy idm --policy keep-lane --policy altruist-rule --seeds 200000:200003 --workers 2 --out /results/builtin
 expect 0 "evaluate a mounted .sumocfg with mounted demand" evaluate --scenario /scenarios/mine.sumocfg \
     --demand '/scenarios/demand/*.rou.xml' --demand '/scenarios/demand/*.trips.xml' --penetration 0.3 \
     --policy idm --policy altruist-rule --seeds 200000:200002 --duration 20 --workers 2 --out /results/mine
-expect 0 "resume what is complete" evaluate --scenario merge --demand contested \
+expect 0 "resume a complete run" evaluate --scenario merge --demand contested \
     --policy idm --policy keep-lane --policy altruist-rule --seeds 200000:200003 --resume --out /results/builtin
 expect 0 "gate: a better policy passes" compare /results/builtin --baseline keep-lane --candidate altruist-rule \
     --across preset --fail-on 'collision_rate > +0.5pp' --junit /results/gate-pass.xml --markdown /results/gate-pass.md
@@ -81,11 +81,11 @@ expect 1 "gate: a worse policy fails" compare /results/builtin --baseline altrui
     --across preset --fail-on 'collision_rate > +0.5pp' --junit /results/gate-fail.xml --markdown /results/gate-fail.md
 expect 2 "gate: an unknown metric is bad input" compare /results/builtin --baseline idm --candidate keep-lane \
     --across preset --fail-on 'colision_rate > 1pp'
-expect 2 "a demand that is not there is bad input" evaluate --scenario /scenarios/mine.sumocfg \
+expect 2 "a missing demand is bad input" evaluate --scenario /scenarios/mine.sumocfg \
     --demand '/scenarios/demand/none*.xml' --out /results/none
-expect 0 "report of the built-in world" report /results/builtin
+expect 0 "report of the shipped scenario" report /results/builtin
 expect 0 "report of the mounted scenario" report /results/mine
-expect 0 "serve: a world, an upload, a kill in between, a replay, a session" --entrypoint tini -- -- \
+expect 0 "serve: a scenario, an upload, a kill in between, a replay, a session" --entrypoint tini -- -- \
     with-caches python /scenarios/serving.py
 expect 0 "rows, JUnit and reports are readable" --entrypoint python -- /scenarios/artefacts.py
 
@@ -93,7 +93,7 @@ fits="yes"
 "${engine[@]}" run "${locked[@]}" "${run_args[@]}" --entrypoint with-caches "$IMAGE" sh -c \
     'cosim run merge --demand contested --policy vfn-p --duration 4 --json >/dev/null 2>&1
      diff -rq /opt/cosim/caches/numba /tmp/cosim-caches/numba' >>"$log" 2>&1 ||
-    fits="no: compiled anew in every container (another processor, or a kernel that warm.sh does not call)"
+    fits="no: compiled in every container (another processor, or a kernel that warm.sh does not call)"
 echo "     the image's compiled kernels fit this processor: $fits" | tee -a "$log"
 
 verdict="passed"

@@ -1,7 +1,7 @@
-"""AVs keep their distance and let the mission vehicle in, by a function of what one of them sees.
+"""A function of one AV's observation: the AV keeps its distance and yields to the mission vehicle.
 
-python examples/own_agent.py                          # a session, driven by your own loop
-cosim run merge --policy examples/own_agent.py:my_agent    # or by everything that cosim has
+python examples/own_agent.py                               # a session in your own loop
+cosim run merge --policy examples/own_agent.py:my_agent    # or as a policy of cosim's commands
 """
 
 import cosim
@@ -11,25 +11,25 @@ X, Y, SPEED, MISSION = (KINEMATIC_FEATURES.index(name) for name in ("x", "y", "s
 
 
 def my_agent(seen: cosim.View) -> MetaAction:
-    """What one AV does."""
+    """The action of one AV."""
     return keep_distance(seen.kinematics[-1], seen.valid[-1])
 
 
 def keep_distance(rows: Floats32, valid: Bools) -> MetaAction:
-    """Fall back from the vehicle close ahead in my lane; the mission vehicle counts beside it as well.
+    """Fall back from a close vehicle ahead in the ego's lane, or from the mission vehicle beside that lane.
 
-    rows [R,F]: the newest frame, myself first; valid [R]: which rows hold a vehicle.
+    rows [R,F]: the newest frame, the ego first; valid [R]: whether a row has a vehicle.
     """
-    mine, others = float(rows[0, SPEED]), rows[1:][valid[1:]]
+    own, others = float(rows[0, SPEED]), rows[1:][valid[1:]]
     reach = 2 + 4 * (others[:, MISSION] > 0)  # m to either side
     near = (others[:, X] > 0) & (abs(others[:, Y]) < reach)
     if not near.any():
         return MetaAction.ACCELERATE
     x, speed = min(others[near][:, (X, SPEED)].tolist())
-    gap = x - 5 + 2 * (speed - mine)  # m, bumper to bumper, 2 s from now
-    if gap < mine + 2:
+    gap = x - 5 + 2 * (speed - own)  # m, bumper to bumper, 2 s from now
+    if gap < own + 2:
         return MetaAction.DECELERATE
-    return MetaAction.ACCELERATE if gap > 1.5 * mine + 10 else MetaAction.IDLE
+    return MetaAction.ACCELERATE if gap > 1.5 * own + 10 else MetaAction.IDLE
 
 
 def main() -> None:
@@ -49,5 +49,5 @@ def drive(session: cosim.Session) -> None:
         print(f"{name:<16} {figures[name].value} {figures[name].unit}")
 
 
-if __name__ == "__main__":  # the simulation starts in a process of its own: it must not run this again
+if __name__ == "__main__":  # the simulation's own process must not run this
     main()

@@ -1,4 +1,4 @@
-"""The agent of own_agent.py, with the simulation on a server: only how the session is opened differs.
+"""The agent of own_agent.py with the simulation on a server; only the opening of the session differs.
 
 cosim serve &
 python examples/remote_agent.py [http://127.0.0.1:8000]

@@ -1,4 +1,4 @@
-"""What `train_sb3_dqn.py --out runs/sb3-dqn.zip` learned, as a policy for everything that cosim has.
+"""The model of `train_sb3_dqn.py --out runs/sb3-dqn.zip` as a policy for cosim's commands.
 
 SB3_MODEL=runs/sb3-dqn.zip cosim evaluate --scenario merge --demand contested --policy idm \
     --policy examples/sb3_policy.py:Dqn --seeds 200000:200010 --out runs/sb3
@@ -18,14 +18,16 @@ from cosim.types import COMPACT, History, PolicyContext
 
 
 class Dqn:
-    """Commands one AV, as in training: the one nearest upstream of the conflict zone (in training it was the
-    one that meets the mission vehicle); SUMO's IDM drives the others."""
+    """Commands the AV nearest upstream of the conflict zone; SUMO's IDM drives the others.
+
+    In training it commanded the AV in conflict with the mission vehicle.
+    """
 
     observation = COMPACT  # as in training
 
     def __init__(self) -> None:
         model = Path(os.environ.get("SB3_MODEL", "runs/sb3-dqn.zip")).absolute()
-        self.files = [model]  # its hash goes into the manifest
+        self.files = [model]  # hashed for the manifest
         self.model = DQN.load(model, device="cpu")
 
     def reset(self, context: PolicyContext) -> None:
@@ -33,7 +35,7 @@ class Dqn:
         self.learner = ""
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, int]:
-        """The chosen AV's action, by its number."""
+        """The chosen AV -> the number of its action."""
         seen = views(histories)
         if self.learner not in seen:
             self.learner = nearest_upstream(seen)

@@ -1,4 +1,4 @@
-"""A signal program of your own, against traci alone: a green that nobody uses ends where others wait.
+"""Your own signal control, written with traci only: it ends an unused green phase if vehicles wait at a red light.
 
 cosim run CITY.sumocfg --penetration 0.3 --policy vfn-p --traci-port 8813 &
 python examples/traci_signals.py 8813
@@ -10,7 +10,7 @@ import traci
 
 
 def waits(light: str, wanted: str) -> bool:
-    """Whether a vehicle is on a lane whose signal now shows one of the states `wanted`."""
+    """Whether a vehicle is on a lane whose signal shows one of the states `wanted`."""
     states = traci.trafficlight.getRedYellowGreenState(light)
     lanes = traci.trafficlight.getControlledLanes(light)
     return any(
@@ -21,14 +21,14 @@ def waits(light: str, wanted: str) -> bool:
 
 
 def switch(light: str) -> None:
-    """End the present phase if it is green for nobody and red for somebody."""
+    """End the present phase if no vehicle uses its green and a vehicle waits at its red."""
     green = "y" not in traci.trafficlight.getRedYellowGreenState(light).lower()
     if green and waits(light, "r") and not waits(light, "Gg"):
         traci.trafficlight.setPhaseDuration(light, 0.0)
 
 
 def main() -> None:
-    """Drive along until SUMO ends."""
+    """Step with SUMO until it ends."""
     traci.init(int(sys.argv[1]), numRetries=60)
     traci.setOrder(1)
     lights = traci.trafficlight.getIDList()

@@ -1,9 +1,9 @@
-"""Train Stable-Baselines3's DQN on the environment of `merge` for a while; its figures before and after.
+"""Train Stable-Baselines3's DQN briefly on the environment of `merge`; prints figures before and after.
 
     python examples/train_sb3_dqn.py --steps 5000 --out runs/sb3-dqn.zip    # driven by examples/sb3_policy.py
 
-One AV learns (the one that meets the mission vehicle), nothing guards it; SUMO's IDM drives the others.
-A few thousand steps raise its return; a safe and altruistic driver takes far more (docs/results/).
+The AV in conflict with the mission vehicle learns, without a safety mask; SUMO's IDM drives the others.
+A few thousand steps raise the return; a safe and altruistic driver takes far more (docs/results/).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import gymnasium
 if TYPE_CHECKING:
     from stable_baselines3 import DQN
 
-VALIDATION_SEED = 100_000  # tuning seeds: not trained on, and not the tests' either (from 200,000)
+VALIDATION_SEED = 100_000  # neither a training seed (below) nor a test seed (from 200,000)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -30,7 +30,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", help="save the model here")
     args = parser.parse_args(arguments)
 
-    # not at the top: the simulation's process imports this file again and needs none of it
+    # not at the top, because the simulation's process imports this file too
     import torch
     from stable_baselines3 import DQN
 
@@ -45,7 +45,7 @@ def main(arguments: list[str] | None = None) -> None:
         batch_size=64,
         target_update_interval=300,
         gamma=0.97,
-        n_steps=8,  # n-step returns, as our own learner has them
+        n_steps=8,  # n-step returns, as in cosim's learner
         buffer_size=50_000,
         learning_starts=min(500, args.steps // 4),
         train_freq=1,

@@ -37,13 +37,13 @@ class Changes:
 
     @property
     def lines(self) -> list[str]:
-        """`better: ...`, `worse: ...`, `no difference shown: ...`; those that are not empty."""
+        """`better: ...`, `worse: ...`, `no difference shown: ...`; only lines that are not empty."""
         kinds = {"better": self.better, "worse": self.worse, "no difference shown": self.alike}
         return [f"{name}: {', '.join(figures)}" for name, figures in kinds.items() if figures]
 
 
 def changes(figures: Mapping[str, PairedFigure]) -> Changes:
-    """Those of `MEASURES` that apply; one pair cannot show that there is no difference."""
+    """The changes in those `MEASURES` that apply. A single pair cannot show that there is no difference."""
     by_tone: dict[str, list[str]] = {GOOD: [], BAD: [], "": []}
     for name, words in MEASURES.items():
         if name in figures and (figure := figures[name]).n:
@@ -55,10 +55,10 @@ def changes(figures: Mapping[str, PairedFigure]) -> Changes:
 
 
 def tone(figure: PairedFigure) -> str:
-    """Whether a difference is good or bad; "" where chance can explain it.
+    """Whether a difference is good or bad; "" if it can be due to chance.
 
-    Chance can if the interval contains 0, or if McNemar's exact p of a rate is 5 % or more: with a handful of
-    crashes Tango's interval can exclude 0 where the exact test does not.
+    It can if the interval contains 0, or if McNemar's exact p of a rate is 5 % or more: with few crashes
+    Tango's interval may exclude 0 although the exact test is not significant.
     """
     d = figure.difference
     chance = math.isnan(d.low) or d.low <= 0.0 <= d.high

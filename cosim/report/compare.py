@@ -113,7 +113,7 @@ class Compared:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Everything that `cosim compare` shows."""
+    """The result of `cosim compare`."""
 
     a: str
     b: str
@@ -171,13 +171,13 @@ def compare(
         a: the baseline.
         b: the candidate.
         fail_on: thresholds (`cosim.report.thresholds`).
-        across: what A and B may differ in, e.g. ("svo_deg",).
+        across: options in which A and B may differ, e.g. ("svo_deg",).
         partial: whether thresholds judge unfinished runs by their finished episodes.
         seed: fixes the bootstrap.
 
     Raises:
-        BadInput: see `pair`; a threshold that cannot be read, that applies to no group, or that is on a
-            figure of a guessed mission vehicle.
+        BadInput: as `pair`; a threshold that is malformed, applies to no group, or is on a figure of a
+            guessed mission vehicle.
     """
     known = {**b.run.measures, **a.run.measures}
     thresholds = [parse(text, known) for text in fail_on]
@@ -245,7 +245,7 @@ def _judge(threshold: Threshold, compared: Compared) -> tuple[str, str, str]:
         figure, what = in_pairs.difference, "B - A"
         judged = wording.number(threshold.of(figure), measure, signed=True)
         shown = wording.interval(figure, measure, signed=True)
-    else:  # of B: pairs in which only A is NA count too
+    else:  # the figure of B includes pairs in which only A is NA
         figure, count = _of_candidate(measure, rows[1], compared.seed)
         what = "B"
         judged = wording.number(threshold.of(figure), measure)
@@ -266,7 +266,7 @@ def _change(measure: Measure, rows: Sequence[Sequence[Row]], seed: int) -> Figur
 
 
 def _of_candidate(measure: Measure, rows: Sequence[Row], seed: int) -> tuple[Figure, str]:
-    """The figure of B over all its episodes, and the count behind it."""
+    """The figure of B over all its episodes, and its counts in words."""
     y = [value for value in measure.values(rows) if not math.isnan(value)]
     if measure.per:
         tally = measure.tally(rows)

@@ -17,9 +17,7 @@ from cosim.workers.tasks import OK
 MIN_EFFECTIVE_CRASHES = 10.0  # with fewer, measured coverage of the intervals is below 95 %
 USEFUL_HALF_WIDTH = 0.5  # of an interval, relative to the rate
 SCALE_POWERS = -6.0, 6.0  # of ten: the range of multiples of the episodes that is searched
-MAX_CRASH_SHARE = (
-    0.25  # of the weight of all crashes in one episode: one more like it would move the estimate
-)
+MAX_CRASH_SHARE = 0.25  # of one episode in the weight of all crashes: a similar one would change the estimate
 
 
 def estimate(rows: Sequence[Row]) -> dict[str, Any]:
@@ -47,8 +45,10 @@ def estimate(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def needed(rows: Sequence[Row]) -> float:
-    """About how many episodes like these narrow the interval of the crash rate to +- `USEFUL_HALF_WIDTH` of
-    the rate; inf without a crash."""
+    """Approximate number of such episodes for an interval of +- `USEFUL_HALF_WIDTH` of the crash rate.
+
+    inf without a crash.
+    """
     tally = INCIDENCES[CRASHES].tally(rows)
     y, k, w = tally[:, ~np.isnan(tally).any(0)]
 
@@ -79,14 +79,16 @@ def text(cell: Mapping[str, Any]) -> str:
 def _notes(cell: Mapping[str, Any]) -> list[str]:
     """Limits of the interval's reliability."""
     if not cell["crashed_episodes"]:
-        return ["no AV crashed: of the crash rate only the upper bound is known"]
+        return ["no AV crashed: only the upper bound of the crash rate is known"]
     count = cell["episodes_needed"]
     useful = f"+-{100 * USEFUL_HALF_WIDTH:.0f} %"
     notes = [f"{useful} takes about {count} episodes"] if count > cell["episodes"] else []
     if cell["effective_crashes"] < MIN_EFFECTIVE_CRASHES:
-        notes.append(f"fewer than {MIN_EFFECTIVE_CRASHES:.0f} effective crashes: go on with more --episodes")
+        notes.append(
+            f"fewer than {MIN_EFFECTIVE_CRASHES:.0f} effective crashes: continue with more --episodes"
+        )
     if (cell["largest_crash_share"] or 0.0) > MAX_CRASH_SHARE:
-        notes.append("one crash holds much of the weight: the tilt misses how it came about")
+        notes.append("one crash has much of the weight: the tilt does not cover its cause")
     return notes
 
 

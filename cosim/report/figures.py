@@ -27,7 +27,7 @@ class Measure:
 
     name: str
     column: str
-    unit: str  # SHARE for a rate, "" where the run does not say
+    unit: str  # SHARE for a rate, "" if unknown
     better: str  # "higher", "lower" or ""
     is_rate: bool = False
     per: str = ""  # of an incidence: the column of its exposure
@@ -59,7 +59,7 @@ class Measure:
 
 
 def weights(rows: Sequence[Row]) -> list[float]:
-    """The likelihood ratio of each episode; 1 where its errors were not tilted (docs/guides/estimate.md)."""
+    """The likelihood ratio of each episode; 1 without a tilt (docs/guides/estimate.md)."""
     return [1.0 if row.get(WEIGHT) is None else float(row[WEIGHT]) for row in rows]
 
 
@@ -98,7 +98,7 @@ NEAR_MISS_RATES: dict[str, Measure] = {
 }
 INCIDENCES = CRASH_RATES | NEAR_MISS_RATES
 
-# What reports and comparisons show first.
+# Figures that reports and comparisons show first.
 HEADLINE = (
     "collision_rate",
     "av_caused_collision_rate",
@@ -115,11 +115,11 @@ HEADLINE = (
 def measures(
     rows: Sequence[Row], units: Mapping[str, str] | None = None, better: Mapping[str, str] | None = None
 ) -> dict[str, Measure]:
-    """Every figure these rows hold, by name: rates, then incidences, then means, then timings.
+    """Every figure of these rows, by name: rates, then incidences, then means, then timings.
 
-    `units` and `better` are by column, as `cosim run --json` gives them with its metrics. Columns of yes and
-    no are rates, columns of numbers means, so a new metric needs no entry here. Tilted episodes (estimate.md)
-    have only incidences and timings: unweighted figures of them describe no real traffic.
+    `units` and `better` are by column, as in `cosim run --json`. Boolean columns become rates, numeric
+    columns means, so a new metric needs no entry here. Tilted episodes (estimate.md) have only incidences
+    and timings, because their unweighted figures do not describe real traffic.
     """
     units, better = units or {}, better or {}
     kinds: dict[str, set[type]] = {}  # of the values that are not NA

@@ -1,7 +1,7 @@
 """Pairs of episodes of A and B: the same traffic under another policy or another version.
 
-A pair is one episode of each side that agree in all of `PAIR`, in `SETTINGS` and in the seed; a group is the
-pairs that agree in `PAIR`. Nothing is pooled over groups.
+The two episodes of a pair agree in `PAIR`, in `SETTINGS` and in the seed. A group has the pairs that agree in
+`PAIR`. Nothing is pooled over groups.
 """
 
 import itertools
@@ -50,7 +50,7 @@ class Group:
 
     @property
     def not_comparable(self) -> int:
-        """Pairs in which either episode says that it must not be compared."""
+        """Pairs with an episode that is marked as not comparable."""
         return sum(not_comparable(a) or not_comparable(b) for a, b in self.pairs)
 
     @property
@@ -65,7 +65,7 @@ class Group:
 
     @property
     def identical(self) -> int:
-        """Pairs in which both drove exactly alike."""
+        """Pairs with equal trace hashes."""
         return sum(a.get("trace_hash") == b.get("trace_hash") for a, b in self.pairs)
 
 
@@ -80,7 +80,7 @@ def errors_begun(pairs: Iterable[tuple[Row, Row]]) -> tuple[int, int, int]:
 
 
 def side(text: str) -> Side:
-    """Read `DIR` or `DIR:POLICY`; of an unfinished run the episodes that are driven.
+    """Read `DIR` or `DIR:POLICY`; an unfinished run has its driven episodes.
 
     Raises:
         BadInput: no such run, or no such policy in it.
@@ -112,12 +112,12 @@ def driver(identity: Mapping[str, Any]) -> str:
 
 
 def pair(a: Side, b: Side, across: Sequence[str] = ()) -> tuple[list[Group], tuple[list[str], list[str]]]:
-    """Groups of pairs in A's order, and the names of the cells that only A, only B has.
+    """Groups of pairs in A's order, and the names of cells that only A or only B has.
 
     `across`: names of `ACROSS` in which A and B may differ.
 
     Raises:
-        BadInput: nothing to pair, no seed in common, a side with several policies against one with one, two
+        BadInput: nothing to pair, no common seed, several policies on one side and one on the other, two
             cells with the same key.
     """
     for name in across:
@@ -198,7 +198,7 @@ def _cells(
         key: _Key = (*(row.get(name) for name in fields), *(driven[name] for name in settings))
         if (
             same_folder
-        ):  # one run may hold different files of equal names: what was asked for tells them apart
+        ):  # a run may have different files of equal names: the requested options distinguish them
             case = {k: v for k, v in side.run.case(row).items() if k not in (*across, "outputs")}
             key += (json.dumps(case, sort_keys=True),)
         rows = cells.setdefault(key, {}).setdefault(tuple(row.get(name) for name in across), {})
@@ -237,7 +237,7 @@ def _name(row: Row) -> str:
 
 
 def _why_none(a: _Cells, b: _Cells, fields: tuple[str, ...]) -> str:
-    """Why nothing could be paired, in one sentence."""
+    """The reason why nothing could be paired, in one sentence."""
     if common := a.keys() & b.keys():
         spans = []
         for cells in (a, b):
@@ -247,7 +247,7 @@ def _why_none(a: _Cells, b: _Cells, fields: tuple[str, ...]) -> str:
     for k, name in enumerate(fields):
         has = [{key[k] for key in cells} for cells in (a, b)]
         if not has[0] & has[1]:
-            way = f" (--across {name} compares them all the same)" if name in ACROSS else ""
+            way = f" (--across {name} compares them anyway)" if name in ACROSS else ""
             return (
                 f"A and B have nothing in common: {name} is {_words(has[0])} in A, {_words(has[1])} in B{way}"
             )

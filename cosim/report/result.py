@@ -38,7 +38,7 @@ NEAR_MISSES = {"ttc": "TTC < 1.5 s", "drac": "DRAC > 3.35 m/s2", "pet": "PET < 1
 
 
 def write_folder(folder: Path, result: EpisodeResult, text: str, outputs: Sequence[str] = ()) -> None:
-    """Write `result.json`, `manifest.json` and `metrics.txt` (`text`); each appears whole or not at all.
+    """Write `result.json`, `manifest.json` and `metrics.txt` (`text`), each atomically.
 
     Films, pages and SUMO outputs of an earlier run in the folder are deleted, except `outputs`, those of this
     run. Raises BadInput when the folder cannot be written.

@@ -20,7 +20,7 @@ from cosim.scenario.options import COLUMNS, FLEET
 from cosim.types import OnCollision, Traffic
 from cosim.workers.tasks import OK
 
-# Options that pairs must agree in and that are no columns of a row: those asked for, and hashes.
+# Options in which pairs must agree and that are not columns of a row: requested options, and hashes.
 SETTINGS = (*(name for name in COLUMNS if name not in FLEET), "errors_sha256", "sensing_sha256", "tilt")
 NEEDED = ("key", "cell", "status", "scenario", "demand", "policy", "seed")
 
@@ -40,7 +40,7 @@ class Run:
 
     @property
     def policies(self) -> list[str]:
-        """Names of the policies, in the order they come."""
+        """Names of the policies, in the order of the rows."""
         return list(dict.fromkeys(str(row["policy"]) for row in self.rows))
 
     @property
@@ -94,7 +94,7 @@ def read(path: str | Path, *, unfinished: bool = False) -> Run:
 
     Args:
         path: the run folder.
-        unfinished: whether a run may be read that continues or was interrupted, as far as it is driven.
+        unfinished: whether to read the driven episodes of a run that still runs or was interrupted.
 
     Raises:
         BadInput: no such folder, no `episodes.parquet` in it, or another program's; no episode yet.
@@ -107,8 +107,10 @@ def read(path: str | Path, *, unfinished: bool = False) -> Run:
         if (folder / FILE).is_file():
             if unfinished:
                 return _so_far(folder)
-            raise BadInput(f"is not finished: `cosim evaluate --resume --out {folder}` goes on", file=folder)
-        raise BadInput("holds no episodes.parquet: is it a run of `cosim evaluate`?", file=folder)
+            raise BadInput(
+                f"is not finished: `cosim evaluate --resume --out {folder}` continues", file=folder
+            )
+        raise BadInput("has no episodes.parquet: is it a run of `cosim evaluate`?", file=folder)
     try:
         rows: list[dict[str, Any]] = pa.parquet.read_table(file).to_pylist()
     except (pa.ArrowException, OSError) as error:
@@ -122,7 +124,7 @@ def read(path: str | Path, *, unfinished: bool = False) -> Run:
 
 
 def _so_far(folder: Path) -> Run:
-    """The episodes in the store of an unfinished run, in the form of a finished one."""
+    """The episodes in the store of an unfinished run."""
     with Store.in_folder(folder) as store:
         if not (rows := store.rows()):
             raise BadInput("has no episode yet", file=folder)
@@ -131,6 +133,6 @@ def _so_far(folder: Path) -> Run:
 
 
 def _with_policy_names(rows: list[dict[str, Any]]) -> list[Row]:
-    """The rows with the name that a policy gives itself: rows of failed episodes have it as typed."""
+    """The rows with the policy's own name also in failed episodes, which have the name as typed."""
     names = {row["cell"]: row["policy"] for row in rows if row["status"] == OK}
     return [{**row, "policy": names.get(row["cell"], row["policy"])} for row in rows]

@@ -1,6 +1,6 @@
 """Values with 95 % intervals: shares, rates, means, quantiles, and differences of pairs on equal seeds.
 
-What is used where, and how it was checked: docs/explanation/statistics.md. NA is nan in here, never 0.
+Uses and validation: docs/explanation/statistics.md. In this module NA is nan, never 0.
 """
 
 import math
@@ -16,10 +16,10 @@ from scipy.optimize import brentq
 
 CONFIDENCE = 0.95
 Z = float(stats.norm.ppf(0.5 + CONFIDENCE / 2.0))
-RESAMPLES = 2000  # bounds of a mean then vary by some 2 % of the interval's width between seeds
-FEW_EVENTS = 3.0  # effective events, from which on their largest weight bounds that of another one
-# Effective events of two rates, and effective samples with an event, from which on the difference of the
-# rates is about normal.
+RESAMPLES = 2000  # bounds of a mean vary by about 2 % of the interval's width between seeds
+FEW_EVENTS = 3.0  # effective events, from which their largest weight bounds the weight of another event
+# Effective events of two rates, and effective samples with an event, from which the difference of the rates
+# is approximately normal.
 NORMAL_EVENTS, NORMAL_SAMPLES = 20.0, 10.0
 MAX_RESAMPLED_VALUES = 2_000_000  # held at once: 16 MB
 
@@ -91,18 +91,17 @@ def pooled_rate(
 ) -> Figure:
     """Events per unit of exposure of n samples: R = sum(w y) / sum(w k), with a gamma interval.
 
-    Of weighted Poisson counts (Fay and Feuer, Statistics in Medicine 16 (1997) 791-801): its variance is
-    that of the ratio, sum(w^2 (y - R k)^2), and at least the Poisson variance sum(w^2 y): events of one
-    episode come together. The upper bound allows for one more event (or as many as come together), of the
-    largest weight of the events seen; of the largest weight of all samples where the events seen are
-    effectively fewer than `FEW_EVENTS`. With equal weights and no more scatter than Poisson counts have it is
-    the exact interval of `rate`.
+    The interval is for weighted Poisson counts (Fay and Feuer, Statistics in Medicine 16 (1997) 791-801). Its
+    variance is that of the ratio, sum(w^2 (y - R k)^2), and at least the Poisson variance sum(w^2 y), since
+    events of one episode are not independent. The upper bound allows for one more event (or a cluster) with
+    the largest weight of the observed events. With fewer effective events than `FEW_EVENTS` it allows for the
+    largest weight of all samples. With equal weights and Poisson scatter it is the exact interval of `rate`.
 
     Args:
         counts: [n] y, events of each sample.
-        exposures: [n] k, what they are divided by.
-        weights: [n] w, positive likelihood ratios; None: all alike.
-        times: gives the interval of this many times as many samples, if they were like these.
+        exposures: [n] k, exposure of each sample.
+        weights: [n] w, positive likelihood ratios; None: all equal.
+        times: factor on the number of samples, for the interval of a larger sample like this one.
     """
     y, k = np.asarray(counts, np.float64), np.asarray(exposures, np.float64)
     w = np.ones(len(y)) if weights is None else np.asarray(weights, np.float64)
@@ -127,8 +126,7 @@ def pooled_rate(
 
 
 def effective(weights: Sequence[float] | Array) -> float:
-    """The effective sample size: how many equal weights tell as much, (sum w)^2 / sum w^2 (Kish 1965); 0 of
-    none."""
+    """The effective sample size (sum w)^2 / sum w^2 (Kish 1965); 0 without weights."""
     w = np.asarray(weights, np.float64)
     total = float((w**2).sum())
     return float(w.sum()) ** 2 / total if total > 0.0 else 0.0
@@ -162,37 +160,36 @@ def quantile(values: Sequence[float] | Array, q: float) -> Figure:
 def paired_share(before: Bools, after: Bools) -> Figure:
     """Difference of two proportions, after - before, with Tango's score interval (1998).
 
-    Unlike the usual ones it keeps its width when no pair differs, and its coverage at small counts.
+    This interval keeps its width if no pair differs, and its coverage at small counts.
     """
     lost, gained = discordant(before, after)
     return _tango(gained, lost, len(before))
 
 
 def discordant(before: Bools, after: Bools) -> tuple[int, int]:
-    """How many pairs went from yes to no, and from no to yes."""
+    """Numbers of pairs that changed from yes to no, and from no to yes."""
     b, a = np.asarray(before, np.bool_), np.asarray(after, np.bool_)
     return int((b & ~a).sum()), int((a & ~b).sum())
 
 
 def mcnemar(lost: int, gained: int) -> float:
-    """Exact two-sided p of "as many pairs change one way as the other" (McNemar 1947); 1 when none does."""
+    """Exact two-sided p of "equally many pairs change either way" (McNemar 1947); 1 without changes."""
     if lost + gained == 0:
         return 1.0
     return float(stats.binomtest(gained, lost + gained, 0.5).pvalue)
 
 
 def signed_rank(before: Sequence[float] | Array, after: Sequence[float] | Array) -> float:
-    """Two-sided p of "pairs change equally in both directions" (Wilcoxon 1945, ties by Pratt); 1 when none
-    changes.
+    """Two-sided p of "pairs change equally in both directions" (Wilcoxon 1945, ties by Pratt).
 
-    Pairs with a nan are left out.
+    1 without changes. Pairs with a nan are left out.
     """
     change = _known(np.asarray(after, np.float64) - np.asarray(before, np.float64))
     return float(stats.wilcoxon(change, zero_method="pratt").pvalue) if change.any() else 1.0
 
 
 def holm(p: Sequence[float]) -> list[float]:
-    """Each p as if it had been the only test: below 0.05 means so for all of them together (Holm 1979)."""
+    """Each p corrected for all of these tests, by Holm's method (1979)."""
     order = np.argsort(p)
     steps = np.minimum(1.0, np.asarray(p)[order] * np.arange(len(p), 0, -1))
     out = np.empty(len(p))
@@ -201,10 +198,10 @@ def holm(p: Sequence[float]) -> list[float]:
 
 
 def power(effect: float, difference: Figure, tests: int = 1) -> float:
-    """The chance that a true difference of `effect` would have been found, with the error of `difference`.
+    """The probability of finding a true difference of `effect`, with the standard error of `difference`.
 
-    Normal, from the width of its interval; `tests`: so many are corrected together (the first step of
-    `holm`). nan where there is no interval.
+    Normal approximation from the width of the interval. `tests`: number of tests that are corrected together
+    (the first step of `holm`). nan without an interval.
     """
     error = (difference.high - difference.low) / (2.0 * Z)
     needed = float(stats.norm.isf((1.0 - CONFIDENCE) / 2.0 / tests))
@@ -220,7 +217,7 @@ def paired_mean(before: Sequence[float] | Array, after: Sequence[float] | Array,
 def paired_change(before: Sequence[float] | Array, after: Sequence[float] | Array, seed: int = 0) -> Figure:
     """Relative change of the mean, mean(after) / mean(before) - 1, bootstrapped over pairs.
 
-    inf or -inf when the mean before is 0 and that after is not; no bounds where a resample could say so.
+    inf or -inf when only the mean before is 0. No bounds if that can happen in a resample.
     """
     both = np.array([before, after], np.float64)
     b, a = both[:, ~np.isnan(both).any(0)]
@@ -233,10 +230,10 @@ def paired_change(before: Sequence[float] | Array, after: Sequence[float] | Arra
 def paired_rate(before: Array, after: Array) -> Figure:
     """Difference of two pooled rates, after - before.
 
-    Each [3,n]: events, exposure and weight of every pair (or [2,n], all alike), as for `pooled_rate`. With
-    effectively `NORMAL_EVENTS` or more its error is that of what single pairs contribute (delta method).
-    With fewer the bounds are recovered from those of the two rates and the correlation of the contributions
-    (MOVER, Zou and Donner, Statistics in Medicine 27 (2008) 1693-1702).
+    `before`, `after`: [3,n] events, exposure and weight of every pair (or [2,n] with equal weights), as for
+    `pooled_rate`. With at least `NORMAL_EVENTS` effective events the error is from the contributions of
+    single pairs (delta method). With fewer the bounds are from the bounds of the two rates and the
+    correlation of the contributions (MOVER, Zou and Donner, Statistics in Medicine 27 (2008) 1693-1702).
     """
     a, b = pooled_rate(*before), pooled_rate(*after)
     if not (a.known and b.known):
@@ -247,7 +244,7 @@ def paired_rate(before: Array, after: Array) -> Figure:
 def paired_rate_change(before: Array, after: Array) -> Figure:
     """Relative change of a pooled rate over pairs [3,n], as `paired_rate` of the logarithms.
 
-    Infinite and without bounds as `paired_change`; without bounds too where there is no event after.
+    Infinite and without bounds as `paired_change`; also without bounds if there is no event after.
     """
     a, b = pooled_rate(*before), pooled_rate(*after)
     if not (a.known and b.known):
@@ -269,9 +266,9 @@ def _weights(tally: Array) -> Array:
 
 
 def _normal(before: Array, after: Array) -> bool:
-    """Whether the difference of the two rates is about normal.
+    """Whether the difference of the two rates is approximately normal.
 
-    Samples with an event are asked for besides events, since the events of one sample come together.
+    That needs events and samples with an event, since events of one sample are not independent.
     """
     y, w = (np.concatenate(both) for both in ((before[0], after[0]), (_weights(before), _weights(after))))
     enough_events = float((w * y).sum()) ** 2 >= NORMAL_EVENTS * float((w**2 * y).sum())
@@ -279,13 +276,13 @@ def _normal(before: Array, after: Array) -> bool:
 
 
 def _contributions(tally: Array, rate: Figure) -> Array:
-    """[n] what each sample adds to the error of a pooled rate."""
+    """[n] the contribution of each sample to the error of a pooled rate."""
     w = _weights(tally)
     return np.asarray(w * (tally[0] - rate.value * tally[1]) / (w * tally[1]).sum())
 
 
 def _difference(a: Figure, b: Figure, part_a: Array, part_b: Array, normal: bool) -> Figure:
-    """b - a with its bounds, from what each pair contributes to the errors of a and b ([n] each)."""
+    """b - a with its bounds, from the contributions of each pair to the errors of a and b ([n] each)."""
     value = b.value - a.value
     if normal:
         reach = Z * float(np.linalg.norm(part_b - part_a)) * math.sqrt(len(part_a) / (len(part_a) - 1))
@@ -303,12 +300,12 @@ def _known(values: Sequence[float] | Array) -> Array:
 
 
 def _change(before: Array, after: Array, axis: int = -1) -> Array:
-    with np.errstate(divide="ignore", invalid="ignore"):  # a resample may hold nothing but zeros
+    with np.errstate(divide="ignore", invalid="ignore"):  # a resample may have only zeros
         return np.asarray(after.mean(axis=axis) / before.mean(axis=axis) - 1.0)
 
 
 def _bootstrap(samples: tuple[Array, ...], statistic: Callable[..., Any], seed: int) -> Figure:
-    """BCa over the common index of the samples; percentiles where BCa is not defined."""
+    """BCa over the common index of the samples; percentiles if BCa is not defined."""
     count = len(samples[0])
     if count == 0:
         return NA
@@ -316,7 +313,7 @@ def _bootstrap(samples: tuple[Array, ...], statistic: Callable[..., Any], seed: 
     if all(np.ptp(s) == 0.0 for s in samples):
         return Figure(value, *[value if count > 1 else math.nan] * 2)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # DegenerateDataWarning: answered below
+        warnings.simplefilter("ignore")  # DegenerateDataWarning: handled below
         found = stats.bootstrap(
             samples,
             statistic,

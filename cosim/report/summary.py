@@ -27,8 +27,8 @@ def summarize(
 ) -> dict[str, Any]:
     """Plain JSON values: counts of the run, and one entry per group with its rates, means and timings.
 
-    Only episodes of status ok enter a figure; `status` counts the episodes by status. Every figure has `n`,
-    the episodes that it is from, and `na`, the ok episodes in which it does not apply. `seed` fixes the
+    Figures are from episodes of status ok; `status` counts the episodes by status. Every figure has `n`, its
+    number of episodes, and `na`, the number of ok episodes in which it does not apply. `seed` fixes the
     bootstrap.
     """
     known = measures(rows, units, better)
@@ -78,7 +78,7 @@ def group_figures(rows: Sequence[Row], known: Mapping[str, Measure], seed: int =
 
 
 def rate_document(measure: Measure, rows: Sequence[Row]) -> dict[str, Any]:
-    """Share of the rows with Wilson's interval; `rule_of_three` where no row is a hit."""
+    """Share of the rows with Wilson's interval; `rule_of_three` if no row is a hit."""
     values = [v for v in measure.values(rows) if not math.isnan(v)]
     hits = int(sum(values))
     never = bool(values) and hits == 0
@@ -121,7 +121,7 @@ def mean_document(measure: Measure, rows: Sequence[Row], seed: int = 0) -> dict[
 
 
 def status_counts(rows: Sequence[Row]) -> dict[str, int]:
-    """How many episodes of each status, zeros too."""
+    """Number of episodes of each status, including zeros."""
     found = Counter(str(row.get("status", OK)) for row in rows)
     return {name: found[name] for name in (*STATUSES, *(found.keys() - set(STATUSES)))}
 
@@ -137,7 +137,7 @@ def mission_guessed(row: Row) -> bool:
 
 
 def reasons(rows: Sequence[Row]) -> dict[str, int]:
-    """Why episodes are not comparable, with the number of episodes; numbers in a reason become "n"."""
+    """Reasons why episodes are not comparable -> number of episodes; numbers in a reason become "n"."""
     counts: Counter[str] = Counter()
     for row in rows:
         listed = row.get("not_comparable_because") or []

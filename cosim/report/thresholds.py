@@ -2,10 +2,11 @@
 
     METRIC[.upper|.lower]  >|<  [+|-]NUMBER[UNIT]
 
-With a sign it bounds the difference B - A on equal seeds, without one the figure of B itself. UNIT: `pp`
-(a difference of shares, in percentage points), `%` (a share; with a sign the change of a mean relative to
-A's), or the metric's own unit, which may be left out. `.upper` and `.lower` take that bound of the 95 %
-interval instead of the value. A share needs its unit, unless it is 0: 0.5 might be a half or half a per cent.
+With a sign the threshold is for the difference B - A on equal seeds, without a sign for the figure of B.
+UNIT: `pp` (a difference of shares, in percentage points), `%` (a share; with a sign the change of a mean
+relative to A's), or the metric's own unit, which may be left out. `.upper` and `.lower` use that bound of
+the 95 % interval instead of the value. A share needs its unit, unless it is 0: 0.5 might be a half or half
+a per cent.
 """
 
 import re
@@ -40,11 +41,11 @@ class Threshold:
     kind: str  # DIFFERENCE, CHANGE or ABSOLUTE
 
     def of(self, figure: Figure) -> float:
-        """The value or bound of a figure that is compared with the limit; nan where there is none."""
+        """The value or bound of a figure that is compared with the limit; nan if it is missing."""
         return {"value": figure.value, "upper": figure.high, "lower": figure.low}[self.bound]
 
     def fails(self, number: float) -> bool:
-        """Whether a number is beyond the limit. nan (NA, or no such bound) fails: it proves nothing."""
+        """Whether a number is beyond the limit. nan (NA, or a missing bound) fails."""
         slack = _SLACK * max(1.0, abs(self.limit))
         return not (number <= self.limit + slack if self.sense == ">" else number >= self.limit - slack)
 
@@ -77,7 +78,7 @@ def _unit(measure: Measure, sign: str, number: float, unit: str | None, text: st
     """The threshold's kind, and its unit in the metric's own unit."""
     kind = DIFFERENCE if sign else ABSOLUTE
     if unit is None and measure.is_share and number != 0.0:
-        raise _wrong(f"{measure.name} is a share: write {'pp' if sign else '%'} behind the number", text)
+        raise _wrong(f"{measure.name} is a share: write {'pp' if sign else '%'} after the number", text)
     if unit is None or (unit == measure.unit and unit not in ("%", "pp")):
         return kind, 1.0
     if unit == "pp":

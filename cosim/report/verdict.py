@@ -110,10 +110,10 @@ def markdown(comparison: Comparison) -> str:
 
 
 def junit(comparison: Comparison, path: Path) -> None:
-    """Write the file that every CI server reads, whole or not at all.
+    """Write the JUnit file for CI servers atomically.
 
-    It has a test case per threshold and group, one per group with simulations that gave no figures, and one
-    if the batch is unfinished. Raises OSError.
+    It has a test case per threshold and group, one per group with simulations without figures, and one if the
+    batch is unfinished. Raises OSError.
     """
     suite = TestSuite("cosim compare")
     for name, value in (("a", comparison.a), ("b", comparison.b), ("verdict", comparison.verdict)):
@@ -154,7 +154,7 @@ def _pairs(count: int) -> str:
 
 
 def _wrapped(note: str, indent: str = "  ") -> list[str]:
-    """Lines of at most `COLUMNS` columns, but for a word that is longer."""
+    """Lines of at most `COLUMNS` columns; longer words are not broken."""
     wrapper = textwrap.TextWrapper(COLUMNS, indent, "    ", break_on_hyphens=False, break_long_words=False)
     return wrapper.wrap(note)
 
@@ -210,8 +210,10 @@ def _group_document(compared: Compared) -> dict[str, Any]:
 
 
 def _shown(comparison: Comparison, compared: Compared) -> list[PairedFigure]:
-    """Figures of the table, where they apply: the headline's and those of thresholds; of all vehicles, of the
-    law and of near-misses only those that are not 0."""
+    """Figures of the table that apply: of the headline and of thresholds.
+
+    Figures of all vehicles, of the law and of near-misses are included if they are not 0.
+    """
     gated = [check.threshold.measure.name for check in comparison.checks]
     always = {*HEADLINE, *gated}
     names = dict.fromkeys((*HEADLINE, *EVERYBODY, *INCIDENCES, *LAW, *gated))
@@ -263,7 +265,7 @@ def _notes(compared: Compared) -> list[str]:
 
 
 def _unfinished(comparison: Comparison) -> list[str]:
-    """How much of the batch is driven, where not all of it is."""
+    """The driven part of an unfinished batch; [] for a finished one."""
     pairs = sum(len(compared.group.pairs) for compared in comparison.groups)
     return [f"unfinished: {'; '.join(comparison.unfinished)}, {pairs} pairs"] if comparison.unfinished else []
 

@@ -1,4 +1,4 @@
-"""How figures are written for people: per cent and percentage points, units, intervals, NA."""
+"""Texts of figures: per cent and percentage points, units, intervals, NA."""
 
 import math
 from collections.abc import Mapping
@@ -8,7 +8,7 @@ from cosim.report.figures import Measure
 from cosim.report.statistics import Figure
 
 NA_TEXT = "NA"
-SEVERAL = 2  # episodes or pairs from which on an interval is shown
+SEVERAL = 2  # episodes or pairs from which an interval is shown
 
 
 def number(
@@ -45,8 +45,8 @@ def value_and_bounds(
 ) -> tuple[str, str]:
     """`12.5 %` and `4.4 to 26.1`, to two digits of the interval's width.
 
-    No bounds where an interval would say nothing: it has no width that is shown, or fewer than `SEVERAL`
-    episodes or pairs (`n`) are behind it.
+    No bounds if the shown interval would have no width, or if there are fewer than `SEVERAL` episodes or
+    pairs (`n`).
     """
     width = (figure.high - figure.low) * (100.0 if measure.is_share else 1.0)
     bare = number(figure.value, measure, signed=signed, unit=unit)

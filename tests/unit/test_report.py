@@ -122,7 +122,12 @@ def test_plots_take_the_theme_of_the_page(full: tuple[Path, Page]) -> None:
     text = (folder / "report.html").read_text()
     assert "var(--series-2)" in text
     assert not re.search(r"#0[1-4]0[0-9]0[0-9]", text)  # no stand-in colour is left
-    for title in ("Episodes with a collision", "Smallest time to collision", "What AVs give", "vetoed"):
+    for title in (
+        "Episodes with a collision",
+        "Smallest time to collision",
+        "Distance of AVs and of the",
+        "vetoed",
+    ):
         assert title in page.text
 
 
@@ -168,7 +173,7 @@ def test_a_run_without_any_figure_is_still_reported(tmp_path: Path) -> None:
 def test_a_run_that_lacks_episodes_says_so(tmp_path: Path) -> None:
     folder = write(tmp_path / "run", cell("idm", 2), cell("own", 1), planned=2)
     page = Page(report.write(read(folder)).read_text())
-    assert "1 of 4 episodes not driven: `cosim evaluate --resume` goes on" in page.text
+    assert "1 of 4 episodes not driven: `cosim evaluate --resume` continues" in page.text
 
 
 def test_an_unfinished_run_is_reported_as_far_as_it_is(
@@ -181,7 +186,7 @@ def test_an_unfinished_run_is_reported_as_far_as_it_is(
     assert read(folder, unfinished=True).rows == whole.rows
     assert main(["report", str(folder)]) == 0
     page = Page(Path(capsys.readouterr().out.strip()).read_text())
-    assert "1 of 4 episodes not driven: `cosim evaluate --resume` goes on" in page.text
+    assert "1 of 4 episodes not driven: `cosim evaluate --resume` continues" in page.text
     with pytest.raises(BadInput, match="has no episode yet"):
         read(begin(tmp_path / "empty", planned=2), unfinished=True)
 
@@ -220,7 +225,7 @@ def test_the_command_writes_the_report_and_refuses_other_folders(
     assert (tmp_path / "r.html").read_text().startswith("<!doctype html>")
     capsys.readouterr()
     assert main(["report", str(tmp_path)]) == 2
-    assert "holds no episodes.parquet" in capsys.readouterr().err
+    assert "has no episodes.parquet" in capsys.readouterr().err
     (folder / "episodes.parquet").write_bytes(b"PAR1 no parquet at all")
     assert main(["report", str(folder)]) == 2
     assert main(["report", str(folder), "--out", str(tmp_path / "none" / "r.html")]) == 2

@@ -1,6 +1,6 @@
-"""The rows of a run as the report shows them: blocks of equal traffic, each with a series per policy.
+"""The rows of a run in the order of the report: blocks of equal traffic, each with a series per policy.
 
-Only figures of one block stand side by side: its series drove the same traffic on the same seeds.
+The report compares only figures of one block, whose series drove the same traffic on the same seeds.
 """
 
 import json
@@ -31,7 +31,7 @@ class Series:
 
     @cached_property
     def ok(self) -> list[Row]:
-        """Episodes that have figures."""
+        """Episodes with figures."""
         return [row for row in self.rows if row["status"] == OK]
 
     @cached_property
@@ -40,7 +40,7 @@ class Series:
         return group_figures(self.rows, self.known)
 
     def counts(self, name: str) -> dict[str, Any]:
-        """Value, interval and counts of one measure; {} where the run does not have it."""
+        """Value, interval and counts of one measure; {} if the run does not have it."""
         kinds = (self.figures[kind] for kind in ("rates", "incidences", "means", "timings"))
         return next((kind[name] for kind in kinds if name in kind), {})
 

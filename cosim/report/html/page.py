@@ -28,16 +28,16 @@ FINDINGS_SHOWN = 8  # without unfolding
 MAX_WORST, MAX_FAILURES = 12, 50  # episodes listed by name
 MAX_MANIFEST_CHARACTERS = 200_000
 COMPARED_FIGURES = tuple(name for name in HEADLINE if name != "veto_rate")  # with the baseline of each block
-FIGURES_OF_ALL = tuple(name for name in EVERYBODY if name != "co2_kg")  # CO2 per km is there
+FIGURES_OF_ALL = tuple(name for name in EVERYBODY if name != "co2_kg")  # CO2 per km is included
 
 
 def write(run: Run, path: Path | None = None, shown: str | None = None) -> Path:
-    """Write the report, by default `report.html` in the run's folder; whole or not at all.
+    """Write the report atomically, by default `report.html` in the run's folder.
 
     `shown`: the run's folder in the commands on the page.
 
     Raises:
-        BadInput: it cannot be written there.
+        BadInput: the file cannot be written.
     """
     path = run.path / FILE if path is None else path
     text = html(run, shown)
@@ -107,11 +107,10 @@ def _verdict(run: Run, all_blocks: Sequence[Block]) -> dict[str, Any]:
     missing = run.missing
     unfit = sum(not_comparable(row) for row in run.rows)
     if missing:
-        words = (
-            f"{missing} of {_count(total + missing, 'episode')} not driven: `cosim evaluate --resume` goes on"
-        )
+        of_all = _count(total + missing, "episode")
+        words = f"{missing} of {of_all} not driven: `cosim evaluate --resume` continues"
     elif not total:
-        words = "No episodes: there is nothing to judge"
+        words = "No episodes"
     elif not ok:
         words = f"None of the {_count(total, 'episode')} gave figures"
     elif ok < total:
@@ -181,7 +180,7 @@ def _worst(rows: Sequence[Row]) -> list[tuple[str, Row]]:
 
 
 def _rank(row: Row) -> tuple[int, float, str]:
-    """Class, order within the class, and reason; the reason is "" where nothing is bad enough."""
+    """Class, order within the class, and reason; the reason is "" for an episode that is not bad."""
     text = row.get("collision_list")
     collisions = json.loads(text) if isinstance(text, str) else (text or [])
     first = min(collisions, key=lambda c: (not c.get("av_caused"), c.get("time") or 0.0), default=None)
@@ -199,13 +198,13 @@ def _rank(row: Row) -> tuple[int, float, str]:
 
 
 def _last_line(row: Row) -> str:
-    """The last line that the simulation of a failed episode wrote, else cosim's own error."""
+    """The last stderr line of a failed episode's simulation, else cosim's error."""
     lines = [line.strip() for line in str(row.get("stderr") or "").splitlines() if line.strip()]
     return lines[-1] if lines else str(row.get("error") or "no reason given")
 
 
 def _traffic(run: Run) -> dict[str, str]:
-    """A user's file -> the SUMO options that its traffic was driven with, in words."""
+    """A user's file -> the SUMO options of its traffic, in words."""
     cells = run.manifest.get("cells", {})
     about = {row["scenario"]: cells.get(row["cell"], {}).get("manifest", {}) for row in run.rows}
     return {name: words for name, driven in about.items() if (words := in_words(driven))}

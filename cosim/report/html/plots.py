@@ -36,7 +36,7 @@ _THEME = {
     **{stand_in: f"var(--series-{k})" for k, stand_in in enumerate(SERIES, 1)},
 }
 _STYLE: Any = {
-    "svg.fonttype": "none",  # text stays text: it can be read, searched, and takes the page's font
+    "svg.fonttype": "none",  # text can be read and searched, and has the page's font
     "svg.hashsalt": "cosim",  # equal rows, equal file
     "font.size": 9.0,
     "font.family": "sans-serif",
@@ -66,7 +66,7 @@ class Plot:
 
     title: str
     svg: Markup
-    note: str  # how to read it
+    note: str  # explanation of the marks
 
 
 def plots(block: Block) -> list[Plot]:
@@ -182,7 +182,7 @@ def _pareto(series: list[Series]) -> Plot | None:
     axes.tick_params(axis="y", colors=FAINT, labelsize=8.5)
     axes.margins(0.15)
     _name_points(axes, [(one.label, x.value, y.value) for one, x, y in points])
-    title = f"What AVs give, what the {beneficiary} get" + ("s" if beneficiary.endswith("vehicle") else "")
+    title = f"Distance of AVs and of the {beneficiary}"
     return Plot(title, _render(figure, title), "Up and to the right is better for all; bars: 95 % intervals.")
 
 

@@ -51,14 +51,14 @@ class Cell:
     """One cell of a table."""
 
     text: str
-    sort: str  # the key by which the column is sorted
+    sort: str  # sort key
     small: tuple[str, ...] = ()  # interval and counts, a line each
     tone: str = ""  # "good", "bad", "warn" or ""
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Heads and rows; `common` says what all rows share."""
+    """Heads and rows; `common`: values that all rows share."""
 
     heads: list[str]
     rows: list[list[Cell]]
@@ -82,7 +82,7 @@ def figures(blocks: Sequence[Block], known: dict[str, Measure]) -> Table:
 
 
 def law(blocks: Sequence[Block], known: dict[str, Measure]) -> Table | None:
-    """One row per cell with the violations by its AVs, red where not 0; None where no episode counts any."""
+    """One row per cell with its AVs' violations, red if not 0; None if no episode counts violations."""
     series, varying = _series(blocks)
     names = [n for n in LAW if any(s.counts(n).get("n") for s in series)]
     if not names:
@@ -100,7 +100,7 @@ def law(blocks: Sequence[Block], known: dict[str, Measure]) -> Table | None:
 
 
 def chosen(blocks: Sequence[Block], known: dict[str, Measure], which: Iterable[str]) -> Table | None:
-    """One row per cell with the figures `which`; None where no episode has any of them."""
+    """One row per cell with the figures `which`; None if no episode has one of them."""
     series, varying = _series(blocks)
     names = [n for n in which if any(s.counts(n).get("n") for s in series)]
     if not names:
@@ -140,7 +140,7 @@ def everything(block: Block) -> Table:
 
 
 def head(measure: Measure) -> str:
-    """The short name of a measure, of an incidence its unit, and the direction that is better."""
+    """The short name of a measure, the unit of an incidence, and the better direction."""
     arrow = {"higher": "\N{NO-BREAK SPACE}↑", "lower": "\N{NO-BREAK SPACE}↓"}.get(measure.better, "")
     unit = f" {measure.unit}" * bool(measure.per)
     return TITLES.get(measure.name, measure.name) + unit + arrow
@@ -160,7 +160,7 @@ def _red_unless_0(cell: Cell, counts: dict[str, Any]) -> Cell:
 
 
 def _named(series: Series, varying: Sequence[str]) -> Cell:
-    """Policy and SVO, and below them what else distinguishes the cell: one column, which stays in view."""
+    """Policy and SVO, and below them the other options that distinguish the cell."""
     identity = series.identity
     text = str(identity["policy"])
     if "svo_deg" in varying and identity["svo_deg"] is not None:
@@ -213,5 +213,5 @@ def _difference(figure: PairedFigure) -> Cell:
 
 
 def _without_unit(measure: Measure) -> Measure:
-    """The measure as cells write it: the unit of an incidence stands in the head of the column."""
+    """The measure for cells; the unit of an incidence is in the head of the column."""
     return replace(measure, unit="") if measure.per else measure

@@ -1,4 +1,4 @@
-"""`cosim replay`: find an episode in a run folder, drive it once more, prove that it is the same, draw it."""
+"""`cosim replay`: find an episode in a run folder, drive it again, check that it is the same, and draw it."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -25,18 +25,18 @@ from cosim.workers.worker import Worker
 
 MANIFEST = "manifest.json"
 ABSENT = "no such file: a folder of cosim run --out or cosim evaluate is needed"
-MOST_NAMED = 8  # episodes of one seed
+MAX_NAMED = 8  # episodes of one seed
 
 
 class ReplayDiffers(CosimError):
-    """The episode driven again is not the recorded one: like a failed threshold, exit code 1."""
+    """The replay differs from the recorded episode: exit code 1, as for a failed threshold."""
 
     exit_code = 1
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """One episode as a run folder remembers it."""
+    """One episode of a run folder."""
 
     case: EpisodeOptions
     options: tuple[str, ...]  # SUMO's own, as typed after `--`
@@ -46,25 +46,25 @@ class Recorded:
 
     @property
     def name(self) -> str:
-        """Of the files that are drawn."""
+        """The name of the drawn files, without suffix."""
         return f"replay-{self.case.key}" if (self.folder / "episodes.parquet").exists() else "replay"
 
 
 def find(folder: Path, episode: str | None) -> Recorded:
     """The episode in a folder of `cosim run --out` (`episode` may be None) or of `cosim evaluate`.
 
-    `episode`: the key, or the seed where only one episode has it.
+    `episode`: the key, or the seed if only one episode has it.
 
     Raises:
-        BadInput: no such folder, not a run folder, no such episode (with the nearest key), one that was not
-            driven to its end.
+        BadInput: no such folder, not a run folder, no such episode (with the nearest key), or an episode that
+            was not driven to its end.
     """
     file, result = folder / MANIFEST, folder / "result.json"
     document = checked(read_json(file, ABSENT), file)
     if "cells" in document:
         return _of_batch(folder, episode)
     if TRACI in document:
-        problem = "other TraCI programs drove along: it cannot be driven again, draw it with --replay at once"
+        problem = "other TraCI clients took part: it cannot be driven again, use --replay with the run itself"
         raise BadInput(problem, file=file)
     if CASE not in document:
         raise BadInput("was not written by this version of cosim run or evaluate", file=file)
@@ -85,10 +85,10 @@ def find(folder: Path, episode: str | None) -> Recorded:
 
 
 def check_inputs(recorded: Recorded) -> tuple[Scenario, list[str]]:
-    """The scenario, its files being those that were driven then; warnings where versions are others.
+    """The scenario with the recorded files, and warnings about other versions.
 
     Raises:
-        BadInput: a file has changed (named), or a setting of the scenario has.
+        BadInput: a file (named) or a setting of the scenario has changed.
     """
     scenario = vetted(recorded.case.scenario(recorded.options))
     then, now = recorded.manifest, manifest(scenario, recorded.case.seed)
@@ -100,7 +100,7 @@ def check_inputs(recorded: Recorded) -> tuple[Scenario, list[str]]:
         if driven[name] != digest:
             raise BadInput(_changed("it was driven", driven[name], digest), file=paths[name])
     if gone := driven.keys() - now["files"].keys():
-        raise BadInput("belonged to the recorded run, and to this one no more", file=min(gone))
+        raise BadInput("belonged to the recorded run, but not to this one", file=min(gone))
     for name in sorted(now.keys() - {"files", "versions", "seed", "options_not_passed_on"}):
         if name in then and (before := _lasting(name, then)) != (here := _lasting(name, now)):
             problem = f"is {here!r} now, it was {before!r} when it was driven"
@@ -113,7 +113,7 @@ def check_inputs(recorded: Recorded) -> tuple[Scenario, list[str]]:
 
 
 def drive(recorded: Recorded, scenario: Scenario, *, check: bool = True) -> tuple[EpisodeResult, ReplayData]:
-    """Drive it again, recorded, in a process of its own.
+    """Drive the episode again in its own process, and record it.
 
     Raises (only with `check`): as `driven`.
     """
@@ -128,11 +128,11 @@ def drive(recorded: Recorded, scenario: Scenario, *, check: bool = True) -> tupl
 def driven(
     recorded: Recorded, call: Callable[..., Any], progress: Callable[..., None], *, check: bool = True
 ) -> tuple[EpisodeResult, ReplayData]:
-    """Drive it again, recorded, on the host whose methods `call` calls by their names.
+    """Drive the episode again on a host, and record it; `call` calls the host's methods by name.
 
     Raises (only with `check`):
         BadInput: the policy's weights or code have changed.
-        ReplayDiffers: the trace hash is another one.
+        ReplayDiffers: the trace hash differs.
     """
     if check:
         _same_policy(recorded.manifest.get(POLICY_FILES, {}), call("policy_files"))
@@ -140,14 +140,14 @@ def driven(
     if check and result.trace_hash != recorded.trace_hash:
         raise ReplayDiffers(
             f"the replay is not the recorded episode: trace hash {result.trace_hash[:16]}... after "
-            f"{result.steps} decisions, recorded was {recorded.trace_hash[:16]}... (--no-check draws it all "
-            "the same)"
+            f"{result.steps} decisions, recorded was {recorded.trace_hash[:16]}... (--no-check draws it "
+            "anyway)"
         )
     return result, replay
 
 
 def beside(recorded: Recorded, policy: str) -> Recorded:
-    """The same traffic and seed with another policy: nothing recorded to be compared with.
+    """The same traffic and seed with another policy, whose trace hash is not checked.
 
     Raises:
         BadInput: there is no such policy.
@@ -164,10 +164,10 @@ def draw(
     gif: Path | None = None,
     follow: str | None = None,
 ) -> None:
-    """Write the page of the first one, the film and the GIF of all, each whole or not at all.
+    """Write the page of the first episode, the film and the GIF of all, each atomically.
 
     Raises:
-        BadInput: `follow` is no vehicle of the episodes; a file cannot be written.
+        BadInput: `follow` is not a vehicle of the episodes; a file cannot be written.
     """
     names = list(dict.fromkeys(track.id for r in episodes for track in r.tracks))
     if follow is not None and follow not in names:
@@ -201,8 +201,8 @@ def _of_batch(folder: Path, episode: str | None) -> Recorded:
             value=episode,
         )
     if len(found) > 1:
-        some = [f"{r['key']} ({r['scenario']} / {r['demand']} / {r['policy']})" for r in found[:MOST_NAMED]]
-        some += ["..."] * (len(found) > MOST_NAMED)
+        some = [f"{r['key']} ({r['scenario']} / {r['demand']} / {r['policy']})" for r in found[:MAX_NAMED]]
+        some += ["..."] * (len(found) > MAX_NAMED)
         problem = f"{len(found)} episodes have this seed: {', '.join(some)}"
         raise BadInput(problem, field="EPISODE", value=episode)
     row = found[0]
@@ -219,7 +219,7 @@ def _of_batch(folder: Path, episode: str | None) -> Recorded:
 
 
 def _same_policy(then: Mapping[str, str], now: Mapping[str, str]) -> None:
-    """Raises BadInput when weights or code are not those that drove it."""
+    """Raises BadInput when weights or code differ from those of the episode."""
     for name, before in then.items():
         if name in now and now[name] != before:
             raise BadInput(_changed("it drove", before, now[name]), file=name)

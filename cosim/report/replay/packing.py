@@ -22,7 +22,7 @@ MARGIN = 500.0  # m around the traffic: roads further away are left out
 FORECAST_EVERY = 2  # every second predicted frame is drawn
 
 
-EVERYWHERE = (np.full(2, -np.inf), np.full(2, np.inf))  # the window that leaves nothing out
+EVERYWHERE = (np.full(2, -np.inf), np.full(2, np.inf))  # an unlimited window
 FACTS = (
     "scenario", "demand", "policy", "policy_label", "behavior", "driver_model", "preset", "errors", "sensing",
     "svo_deg", "seed", "steps", "trace_hash", "not_comparable_because", "mission_vehicle", "mission_guessed",
@@ -61,9 +61,9 @@ def document(replay: ReplayData) -> dict[str, Any]:
 
 
 class Names:
-    """Numbers in place of vehicles and words, which are written once; word 0 is empty.
+    """Numbers of vehicles and words, which are written once; word 0 is empty.
 
-    What concerns a vehicle without a number is left out.
+    Data of vehicles without a number are left out.
     """
 
     def __init__(self, vehicles: Iterable[str] = ()) -> None:
@@ -87,8 +87,10 @@ class Names:
         ]
 
     def beliefs(self, beliefs: Mapping[str, Belief] | None) -> list[list[Any]] | None:
-        """[AV, [[vehicle, x dm, y dm, age ds, source], ...], [[vehicle, why unseen], ...]] each; None: each
-        knew everything. Places are differences to the true ones."""
+        """[AV, [[vehicle, x dm, y dm, age ds, source], ...], [[vehicle, why unseen], ...]] each.
+
+        None: ideal sensing. Positions are differences to the true ones.
+        """
         known = self.vehicles
         if beliefs is None:
             return None
@@ -159,15 +161,15 @@ class DrawnRoad:
         signals: int,
         window: tuple[Floats, Floats] = EVERYWHERE,
     ) -> None:
-        shown = [k for k, lane in enumerate(road.lanes) if _meets(lane.shape, window)]
+        shown = [k for k, lane in enumerate(road.lanes) if _overlaps(lane.shape, window)]
         place = self.lanes = {lane: k for k, lane in enumerate(shown)}
         lines = [line for line in stop_lines(road) if line.lane in place]
-        crossings = [c for c in road.crossings if _meets(c.shape, window)]
+        crossings = [c for c in road.crossings if _overlaps(c.shape, window)]
         named = {s for line in lines for s in line.signals} | {c.signal for c in crossings}
         signal = self.signals = {s: k for k, s in enumerate(sorted(s for s in named if 0 <= s < signals))}
         self.document: dict[str, Any] = {
             "lanes": [_lane(road, k) for k in shown],
-            "junctions": [_line(shape) for shape in road.junctions if _meets(shape, window)],
+            "junctions": [_line(shape) for shape in road.junctions if _overlaps(shape, window)],
             "goal": [place[k] for k in sorted(goal) if k in place],
             "zones": sorted({place[k] for zone in road.zones for k in zone.lanes if k in place}),
             "stop_lines": [
@@ -189,7 +191,7 @@ def vehicle(
 
 
 def collision(c: Collision) -> dict[str, Any]:
-    """What is said of it, and where it is marked."""
+    """A collision's data for the list of events, and its position."""
     return {
         "t": ms(c.time), "collider": c.collider, "victim": c.victim, "kind": c.kind, "lane": c.lane,
         "x": _finite(c.x), "y": _finite(c.y), "av_caused": c.av_caused, "human_error": c.human_error_involved,
@@ -203,7 +205,7 @@ def shapes(actors: Collection[int]) -> dict[int, list[Any]]:
 
 
 def facts(result: Mapping[str, Any]) -> dict[str, Any]:
-    """What stands at the head of the page and in its table of figures, of a `EpisodeResult.document`."""
+    """Data for the head of the page and its table of figures, from an `EpisodeResult.document`."""
     units = result.get("units", {})
     return {
         **{name: result.get(name) for name in FACTS},
@@ -212,7 +214,7 @@ def facts(result: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def forecast_interval(f: Forecast) -> float:
-    """s between the predicted places that are drawn."""
+    """s between the drawn predictions."""
     return f.interval * FORECAST_EVERY
 
 
@@ -253,8 +255,8 @@ def _window(r: ReplayData) -> tuple[Floats, Floats]:
     return points.min(1) - MARGIN, points.max(1) + MARGIN
 
 
-def _meets(shape: Floats, window: tuple[Floats, Floats]) -> bool:
-    """Whether a shape [p,2] m reaches into the window."""
+def _overlaps(shape: Floats, window: tuple[Floats, Floats]) -> bool:
+    """Whether the bounding box of a shape [p,2] m overlaps the window."""
     return bool((shape.max(0) >= window[0]).all() and (shape.min(0) <= window[1]).all())
 
 

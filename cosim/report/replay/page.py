@@ -1,4 +1,4 @@
-"""The replay as one self-contained HTML file: no network, no library, a plain canvas."""
+"""The replay as one self-contained HTML file with a canvas, without libraries or network access."""
 
 import base64
 import gzip
@@ -11,14 +11,8 @@ from cosim.recording.replay_data import ReplayData
 from cosim.report.replay.packing import document
 
 ASSETS = resources.files(__package__).joinpath("assets")
-VIEWER = (
-    "text.js",
-    "data.js",
-    "view.js",
-    "draw.js",
-    "panel.js",
-    "main.js",
-)  # scripts of the viewer, independent of the data's source
+# Scripts of the viewer, independent of the data's source.
+VIEWER = ("text.js", "data.js", "view.js", "draw.js", "panel.js", "main.js")
 
 
 def page(replay: ReplayData) -> str:
@@ -36,7 +30,7 @@ def page(replay: ReplayData) -> str:
 
 
 def viewer(nav: str = "", stage: str = "", aside: str = "") -> str:
-    """The body of a page that draws; what is added at the head, over the scene and at the side is HTML."""
+    """The body of the viewer's page. `nav`, `stage`, `aside`: HTML at the head, over the scene, aside."""
     return Template(asset("viewer.html")).substitute(nav=nav, stage=stage, aside=aside)
 
 

@@ -22,8 +22,8 @@ class StopLine(NamedTuple):
     """The end of one lane at a junction."""
 
     lane: int
-    rule: Rule  # PRIORITY, YIELD, STOP or ALL_WAY_STOP; of use where there is no signal, or one that is off
-    signals: tuple[int, ...]  # indices into `Snapshot.signals`, of the leftmost turn first
+    rule: Rule  # PRIORITY, YIELD, STOP or ALL_WAY_STOP; valid without a signal, or with a signal that is off
+    signals: tuple[int, ...]  # indices into `Snapshot.signals`, the leftmost turn first
 
 
 def stop_lines(road: RoadMap) -> list[StopLine]:
@@ -32,11 +32,11 @@ def stop_lines(road: RoadMap) -> list[StopLine]:
     for link in road.links:
         links.setdefault(link.origin, []).append(link)
     found = []
-    for lane, ways in sorted(links.items()):
-        turns = sorted(ways, key=lambda way: -_turn(road, way))
-        signals = tuple(dict.fromkeys(way.signal for way in turns if way.signal >= 0))
-        rules = {way.rule for way in ways}
-        # a lane of which one way has priority has no line before which to give way
+    for lane, outgoing in sorted(links.items()):
+        turns = sorted(outgoing, key=lambda link: -_turn(road, link))
+        signals = tuple(dict.fromkeys(link.signal for link in turns if link.signal >= 0))
+        rules = {link.rule for link in outgoing}
+        # no yield line on a lane with a link that has priority
         rule = next((r for r in SIGNED if r in rules), Rule.PRIORITY)
         rule = Rule.PRIORITY if rule == Rule.YIELD and Rule.PRIORITY in rules else rule
         if signals or rule in SIGNED:
@@ -45,7 +45,7 @@ def stop_lines(road: RoadMap) -> list[StopLine]:
 
 
 def heading_at_end(shape: Floats) -> float:
-    """Of a lane's last stretch [p,2] m, in rad."""
+    """Heading of the last segment of a lane's shape [p,2] m, rad."""
     dx, dy = shape[-1] - shape[-2]
     return math.atan2(dy, dx)
 
@@ -70,7 +70,7 @@ def zebra(crossing: Crossing) -> list[Floats]:
 
 
 def _turn(road: RoadMap, link: Link) -> float:
-    """How far it turns, rad, left positive."""
+    """The turn of a link, rad, positive to the left."""
     origin, target = road.lanes[link.origin].shape, road.lanes[link.target].shape
     turn = math.atan2(*(target[1] - target[0])[::-1]) - heading_at_end(origin)
     return (turn + math.pi) % (2.0 * math.pi) - math.pi

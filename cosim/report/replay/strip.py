@@ -1,4 +1,4 @@
-"""The road of one moment from above, drawn by Pillow twice as fine as it is shown."""
+"""The road at one time from above, drawn by Pillow at twice the shown resolution."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,7 @@ from cosim.report.replay.signs import LAMPS, StopLine, heading_at_end, states_at
 from cosim.road import Rule
 from cosim.types import Actor, Floats, Kind, MetaAction
 
-FINE = 2  # drawn this much larger, then reduced: smooth edges
+FINE = 2  # factor of the drawn resolution, for smooth edges
 ACROSS = 200.0  # m of road across the picture's width
 SEEN = 10.0  # pixels, minimum length of persons and bicycles
 SIGMAS = 2.0  # half the width of a predicted interval, in standard deviations
@@ -36,7 +36,7 @@ Colour = tuple[int, ...]
 
 
 def command_sign(action: MetaAction, heading: float) -> str:
-    """What stands beside an AV that drives towards `heading` (rad): "" where it is to go on as it does."""
+    """The sign of a command beside an AV with `heading` (rad); "" for IDLE."""
     if action in LANE:
         return ARROWS[round((heading + LANE[action]) / (math.pi / 4)) % len(ARROWS)]
     return SPEED.get(action, "")
@@ -71,7 +71,7 @@ def poses_at(r: ReplayData, time: float) -> list[Pose]:
 
 
 def colour_of(track: Track) -> Colour:
-    """Mission vehicles first, then AVs, then HVs by class; persons have one of their own."""
+    """The colour by role: mission vehicle, person, AV, or the HV's driver class."""
     if track.mission:
         return MISSION
     if track.kind == Kind.PERSON:
@@ -96,7 +96,7 @@ class Strip:
         self._x, self._y = x, y
         self._scale = width * FINE / ACROSS  # pixels per m
         self._middle = 0.5 * width * FINE, 0.5 * height * FINE
-        self._half = 0.5 * ACROSS + 15.0, 0.5 * ACROSS * height / width + 15.0  # m seen, and some
+        self._half = 0.5 * ACROSS + 15.0, 0.5 * ACROSS * height / width + 15.0  # m, with a margin of 15
 
     def _pixels(self, points: Floats) -> list[tuple[float, float]]:
         """[p,2] m -> pixels"""
@@ -176,7 +176,7 @@ class Strip:
         self._pen.polygon(points, fill=LAMPS.get(state, OTHER), outline=HOUSING, width=FINE)
 
     def forecast(self, r: ReplayData, k: int) -> None:
-        """Predicted paths, with an ellipse every second that holds the interval."""
+        """Predicted paths, with the interval as an ellipse every second."""
         forecast = r.forecasts[k] if 0 <= k < len(r.forecasts) else None
         if forecast is None:
             return
@@ -203,7 +203,7 @@ class Strip:
         self.shape(parts + SENSOR * (t.kind == Kind.AV), p, colour_of(t))
 
     def shape(self, parts: Shape, p: Pose, colour: Colour) -> None:
-        """Parts of a shape, at the size that is drawn at least."""
+        """Parts of a shape, enlarged to the minimum drawn size."""
         least = LEAST.get(p.track.actor, (0.0, 0.0))
         grown = max(SEEN * FINE / (self._scale * max(least)), 1.0) if any(least) else 1.0
         size = max(p.track.length, grown * least[0]), max(p.track.width, grown * least[1])
@@ -237,8 +237,8 @@ class Strip:
         side = 0.62 * p.track.length * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
         self._pen.line(self._pixels(side + np.array([p.x, p.y])), fill=CORRECTION, width=2 * FINE)
 
-    def erring(self, p: Pose, other: Pose | None) -> None:
-        """A triangle on a driver in error, and a line to the vehicle affected first."""
+    def driver_error(self, p: Pose, other: Pose | None) -> None:
+        """A triangle on a driver with an error, and a line to the vehicle affected first."""
         x, y = self._pixel(p.x, p.y)
         if other is not None:
             self._pen.line([(x, y), self._pixel(other.x, other.y)], fill=(*ERROR, 170), width=FINE)

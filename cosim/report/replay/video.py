@@ -1,7 +1,7 @@
-"""The replay as an MP4 or a GIF: a strip of road that follows one vehicle, and what is decided there.
+"""The replay as an MP4 or a GIF: a strip of road that follows one vehicle, and an AV's decisions.
 
-Several episodes (the same seed with other policies, say) are drawn one above the other, each followed by a
-camera of its own, at equal times since they began.
+Several episodes (for example the same seed with other policies) are drawn one above the other at equal
+elapsed times, each with its own camera.
 """
 
 import math
@@ -43,7 +43,7 @@ WIDTH, HEIGHT = 1280, 400  # pixels
 PANEL = 140  # pixels of text beneath the road
 RATE = 10  # pictures a second
 SMALL, LOW, CAPTION = 800, 112, 24  # pixels: width of a GIF, height of its road and of the line beneath
-STEP, SHOWN = 0.4, 0.2  # s from picture to picture of a GIF, and s that each is shown: twice as fast
+STEP, SHOWN = 0.4, 0.2  # s between pictures of a GIF, and s that each is shown: twice real time
 COLOURS = 64  # of a GIF
 SHOWN_CRASH = 4.0  # s that a collision stays marked
 SHOWN_EVENT = 2.0  # s that a correction or an offence stays marked
@@ -63,7 +63,7 @@ def film(
 ) -> None:
     """Write the MP4. `follow`: a vehicle's id (default: the mission vehicle, else the first AV).
 
-    The file appears whole or not at all. Raises OSError when it cannot be written.
+    The file is written atomically. Raises OSError when it cannot be written.
     """
     fast = {"movflags": "faststart"}
     with whole(path) as draft, av.open(str(draft), "w", format="mp4", options=fast) as container:
@@ -99,8 +99,10 @@ def _pictures(
     *,
     small: bool = False,
 ) -> Iterator[npt.NDArray[np.uint8]]:
-    """`rate` pictures [height,width,3] a second, all episodes one above the other; those that ended earlier
-    stand still."""
+    """`rate` pictures [height,width,3] a second, all episodes one above the other.
+
+    Episodes that ended earlier show their last picture.
+    """
     cameras = [_Camera(r, follow) for r in episodes]
     count = round(rate * max(float(r.times[-1] - r.times[0]) for r in episodes)) + 1
     for k in range(count):
@@ -126,8 +128,10 @@ class _Camera:
             self.x, self.y = float(self.follow.x[0]), float(self.follow.y[0])
 
     def look(self, poses: list[Pose]) -> Pose | None:
-        """Move to the followed vehicle; the AV whose decision is explained: itself, else the nearest one, to
-        which the camera moves where an AV is followed that nobody asked for."""
+        """Move to the followed vehicle; returns the AV whose decision is shown: itself, else the nearest AV.
+
+        If the followed AV was not requested and has left the road, the camera follows the nearest AV.
+        """
         here = next((p for p in poses if self.follow and p.track.id == self.follow.id), None)
         if here is not None:
             self.x, self.y = here.x, here.y
@@ -156,13 +160,13 @@ def picture_at(r: ReplayData, time: float, camera: _Camera, *, small: bool = Fal
     for pose in near:
         strip.vehicle(pose)
     under_way = [e for e in r.errors if e.time <= time + 0.05 and e.until > time - 0.05]
-    erring = {e.who: (e.kind.replace("_", " "),) for e in under_way}
+    error_of = {e.who: (e.kind.replace("_", " "),) for e in under_way}
     for pose in () if small else near:
         if pose.track.id in choices:
             strip.choice(pose, choices[pose.track.id], by_name)
         named = [pose.track.id] if pose.track.mission or pose is shown else []
-        if words := ": ".join([*named, *erring.get(pose.track.id, ())]):
-            strip.name(pose, words, ERROR if pose.track.id in erring else TEXT)
+        if words := ": ".join([*named, *error_of.get(pose.track.id, ())]):
+            strip.name(pose, words, ERROR if pose.track.id in error_of else TEXT)
     seen = {p.track.id for p in near}
     for one in r.offences:
         if one.vehicle in seen and 0.0 <= time - one.time + 0.05 < SHOWN_EVENT:
@@ -172,7 +176,7 @@ def picture_at(r: ReplayData, time: float, camera: _Camera, *, small: bool = Fal
             strip.corrected(by_name[correction.vehicle])
     for error in under_way:
         if error.who in seen:
-            strip.erring(by_name[error.who], by_name.get(error.near))
+            strip.driver_error(by_name[error.who], by_name.get(error.near))
     for crash in r.collisions:
         if math.isfinite(crash.x) and 0.0 <= time - crash.time + 0.05 < SHOWN_CRASH:
             strip.crash(crash.x, crash.y)
@@ -230,7 +234,7 @@ class _Board:
         shown: Pose | None,
         choices: Mapping[str, Choice],
     ) -> None:
-        """What the page says too: the episode, the followed vehicle, and one AV's decision explained."""
+        """The episode, the followed vehicle, and one AV's decision, as on the page."""
         f, line = r.facts, self._line_top
         label = f" ({f['policy_label']})" if f.get("policy_label") else ""
         title = f"{f.get('scenario')} / {f.get('demand')} / {f.get('policy')}{label}"
@@ -249,9 +253,9 @@ class _Board:
             where = f"{here[t.id].speed:.1f} m/s" if t.id in here else "not on the road"
             self._wrapped(14, line + 104, f"{t.id} ({what}): {where}", colour_of(t), SPLIT - 24, most=1)
         counts = {
-            f"law broken {len(broken)} times": LAW if broken else None,
-            f"AVs corrected {len(corrections)} times": CORRECTION if corrections else None,
-            f"humans erred {len(errors)} times": ERROR if errors else None,
+            f"{len(broken)} violations": LAW if broken else None,
+            f"{len(corrections)} corrections of AVs": CORRECTION if corrections else None,
+            f"{len(errors)} human errors": ERROR if errors else None,
         }
         if said := {text: colour for text, colour in counts.items() if colour}:
             self._line(14, line + 121, f"{', '.join(said)} so far", next(iter(said.values())), 12)
@@ -261,7 +265,7 @@ class _Board:
             self._decision(SPLIT, line, shown, choices.get(shown.track.id), reason)
 
     def _decision(self, left: float, top: float, av_: Pose, c: Choice | None, corrected: str | None) -> None:
-        """The command of one AV and why; `corrected`: why its car drives otherwise."""
+        """The command of one AV and its reasons; `corrected`: the reason of the car's intervention."""
         name = f"{av_.track.id}, {av_.speed:.1f} m/s: "
         room = self.picture.width - 14 - left
         why = f"corrected by the car: {corrected}"
@@ -295,7 +299,7 @@ class _Board:
     def _wrapped(
         self, x: float, y: float, text: str, colour: Colour, room: float, *, most: int = 2, bold: bool = False
     ) -> int:
-        """Text within `room` pixels on `most` lines, the last one cut with dots; how many it took."""
+        """Write text within `room` pixels on at most `most` lines, cut with dots; returns their number."""
         lines, letters = [""], font(13, bold)
         for word in text.split():
             longer = f"{lines[-1]} {word}".strip()
@@ -334,9 +338,9 @@ def _outcome(r: ReplayData, time: float) -> tuple[str, Colour]:
     crashes = [c for c in r.collisions if c.time <= time + 0.05]
     if crashes:
         return f"collision: {crashes[-1].collider} hit {crashes[-1].victim}", BAD
-    served = r.facts.get("mission_time_s")
-    if served is not None and time - r.begin >= served - 0.05:
-        return f"mission fulfilled at {served:.1f} s", GOOD
+    fulfilled = r.facts.get("mission_time_s")
+    if fulfilled is not None and time - r.begin >= fulfilled - 0.05:
+        return f"mission fulfilled at {fulfilled:.1f} s", GOOD
     if r.facts.get("mission_success") is None:
         return "no collision so far", QUIET
     return f"no collision, mission not fulfilled{' yet' if time < r.times[-1] - 0.05 else ''}", QUIET

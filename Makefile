@@ -1,9 +1,9 @@
-# `make demo` and `make test` are all the set-up there is (README); `make quick` after every change.
+# `make demo` and `make test` include the set-up (README). Use `make quick` after every change.
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-# pip compiles on one core, and what nobody imports too. Not to compile is no way: where Python may write no
-# bytecode (PYTHONDONTWRITEBYTECODE), every process would compile what it imports, torch for one, again.
+# pip would compile on one core, including modules that are never imported. Without any compilation and with
+# PYTHONDONTWRITEBYTECODE, every process would compile its imports again (torch among them).
 PIP = $(BIN)/pip install --quiet --no-compile -c constraints.txt
 COMPILE = $(BIN)/python -W ignore -m compileall -qq -j 0 -x '/tests?/|/sumo/' $(VENV)/lib || true
 RUN ?= runs/demo
@@ -11,7 +11,7 @@ SCALE ?= 1
 WORKERS ?= 2
 SAMPLE ?= 20
 PROCESSES ?= 2
-# A file's tests stay in one process, in the order of the folders: the longest files come first. A core each: no threads.
+# The tests of a file stay in one process, in the order of the folders, long files first. One thread per process.
 PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(PROCESSES) --dist loadfile --no-loadscope-reorder --durations=40
 
 .PHONY: demo test soak docs quick pytest unit check kernels nets results pages results-small audit image smoke clean
@@ -22,15 +22,15 @@ demo: $(VENV)/.installed
 test: $(VENV)/.installed-dev
 	$(MAKE) --no-print-directory -j 2 check pytest
 
-# What takes too long for `make test`: every measured page in small, a server on Ray, two on one database.
+# Tests that take too long for `make test`: every measured page in small, a server on Ray, two on one database.
 soak: kernels
 	$(PYTEST) -m soak
 
-# Kernels first, so that the tests' processes do not compile the same ones at once.
+# Kernels first, so that test processes do not compile the same kernels at the same time.
 pytest: kernels
 	$(PYTEST)
 
-# What a developer wants to know after every change: lint, and the tests that neither train nor need SUMO.
+# Checks after every change: lint, and the tests without training or SUMO.
 quick: $(VENV)/.installed-dev
 	$(MAKE) --no-print-directory -j 2 check unit
 
@@ -50,11 +50,11 @@ check: $(VENV)/.installed-dev
 docs: $(VENV)/.installed-dev
 	PYTHONPATH=. $(BIN)/zensical build --strict --clean
 
-# Every table and figure of docs/results/: first what is measured (costs, predictions; better on an idle
-# machine), then what claims need driven (research/claims). The same command continues after an interruption.
-# SCALE=0.1: a tenth of the episodes. Those in docs/results/episodes/ need not be driven; ANEW=1 drives them all
-# the same, `make audit` a few of them. What has no trained weights is left out and named; `python -m research list`
-# says what is still to be driven, and its CPU hours.
+# Every table and figure of docs/results/: first the benchmarks (costs, predictions; better on an idle machine),
+# then the episodes of claims (research/claims). The same command continues after an interruption. SCALE=0.1: a
+# tenth of the episodes. Episodes in docs/results/episodes/ are not driven again, except with ANEW=1; `make audit`
+# drives a sample of them. Policies without trained weights are skipped and named. `python -m research list` lists
+# missing episodes and their CPU hours.
 CLAIMS = --scale $(SCALE) --workers $(WORKERS) $(if $(ANEW),--anew)
 results: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.measured
@@ -63,15 +63,15 @@ results: $(VENV)/.installed-dev
 	$(BIN)/python -m research.figure8 $(CLAIMS)
 	$(BIN)/python -m research page $(CLAIMS)
 
-# The pages of the episodes that are there (docs/results/episodes/, runs/research): minutes, nothing is driven.
+# The pages of the known episodes (docs/results/episodes/, runs/research): takes minutes, without driving.
 pages: $(VENV)/.installed-dev
 	$(BIN)/python -m research page
 
-# Some of the kept episodes driven anew: are they the same in every figure and the trace hash?
+# Drives a sample of the kept episodes again and compares every figure and the trace hash.
 audit: $(VENV)/.installed-dev
 	$(BIN)/python -m research audit --sample $(SAMPLE) --workers $(WORKERS)
 
-# The same in small: one scenario, two episodes each on validation seeds, two seconds long. Shows that all works.
+# `make results` in small, as a test: one scenario, two episodes of two seconds each on validation seeds.
 SMALL = --seeds 150000:150002 --scenario merge --duration 2 --untrained --workers $(WORKERS) \
     --runs runs/results-small/research --out runs/results-small/pages
 results-small: $(VENV)/.installed-dev
@@ -81,7 +81,7 @@ results-small: $(VENV)/.installed-dev
 	$(BIN)/python -m research.figure8 $(SMALL)
 	$(BIN)/python -m research page $(SMALL)
 
-# Rebuild every world's net from its plain XML sources.
+# Rebuild every scenario's net from its plain XML sources.
 nets: $(VENV)/.installed-dev
 	$(BIN)/python -m sumo_scenarios.build
 
@@ -97,11 +97,11 @@ $(VENV)/.installed-dev: $(VENV)/.installed
 	$(COMPILE)
 	touch $@
 
-# The container: docker/build.sh says what it needs, with a Docker engine or without (docs/guides/container.md).
+# The container image: see docker/build.sh for requirements, with or without a Docker engine.
 image:
 	docker/build.sh
 
-# From build to gate verdict; leaves rows, JUnit and reports in runs/smoke.
+# Build and test the image; rows, JUnit and reports are in runs/smoke.
 smoke: image
 	docker/smoke.sh runs/smoke
 

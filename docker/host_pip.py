@@ -1,8 +1,8 @@
 """Passes this machine's pip settings to an image's build: `host_pip.py FOLDER`.
 
 The build uses the same sources of packages: folders of wheels, indexes, a certificate bundle. FOLDER gets a
-pip.conf and the bundle. The folders in the settings are printed for mounting, a line `SOURCE TARGET` each. The
-pip.conf has only mounted paths, so that no path of this machine gets into the image.
+pip.conf and the bundle. The folders in the settings are printed for mounting, a line `SOURCE TARGET` each.
+The pip.conf has only mounted paths, so that no path of this machine gets into the image.
 """
 
 from __future__ import annotations

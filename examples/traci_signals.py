@@ -1,4 +1,4 @@
-"""Your own signal control, written with traci only: it ends an unused green phase if vehicles wait at a red light.
+"""Your own signal control, written with traci only: ends an unused green if vehicles wait at a red.
 
 cosim run CITY.sumocfg --penetration 0.3 --policy vfn-p --traci-port 8813 &
 python examples/traci_signals.py 8813

@@ -1,4 +1,4 @@
-"""Reads what the smoke run left in /results as its users would: a JSON parser, Parquet, JUnit, a browser."""
+"""Checks the files of the smoke test in /results as users read them: JSON, Parquet, JUnit, HTML."""
 
 import json
 import re
@@ -12,7 +12,7 @@ RESULTS = Path("/results")
 
 
 def main() -> int:
-    """An AssertionError names the first thing that is not as it must be."""
+    """Raises AssertionError at the first file that is wrong."""
     run = json.loads((RESULTS / "run.json").read_text())
     assert run["scenario"] == "merge", run["scenario"]
     assert run["steps"] > 50, run["steps"]

@@ -1,4 +1,4 @@
-"""Asks from inside the container whether it is as locked up as the smoke run means it to be."""
+"""Checks from inside the container that it has the restrictions of the smoke test."""
 
 import os
 import socket
@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def refusals() -> dict[str, bool]:
-    """What must not be possible -> whether it is refused."""
+    """Restriction -> whether it holds."""
     status = dict(
         line.split(":\t", 1) for line in Path("/proc/self/status").read_text().splitlines() if ":\t" in line
     )
@@ -17,7 +17,7 @@ def refusals() -> dict[str, bool]:
         "new privileges": status["NoNewPrivs"].strip() == "1",
         "writing the root": not _writes("/") and not _writes("/opt/cosim") and not _writes("/scenarios"),
         "network interfaces": [name for _, name in socket.if_nameindex() if name != "lo"] == [],
-        "writing /tmp is refused, which it must not be": _writes("/tmp") and _writes("/results"),
+        "writing to /tmp and /results must be possible": _writes("/tmp") and _writes("/results"),
     }
 
 

@@ -1,4 +1,4 @@
-"""Serves inside the container and asks as users would: a world, an upload, a kill, a replay, a session."""
+"""Serves inside the container and tests requests: a scenario, an upload, a kill, a replay, a session."""
 
 import contextlib
 import http.client
@@ -15,7 +15,7 @@ PARTS = ("mine.sumocfg", "mine.net.xml", "demand/morning.rou.xml", "demand/eveni
 
 
 def ask(path: str, sent: Any = None, kind: str = "application/json") -> bytes:
-    """The body of the answer; what is sent makes it a POST."""
+    """The body of the answer to a GET, or to a POST if something is `sent`."""
     body = sent if sent is None or isinstance(sent, bytes) else json.dumps(sent).encode()
     with contextlib.closing(http.client.HTTPConnection("127.0.0.1", 8000, timeout=120.0)) as server:
         server.request("GET" if body is None else "POST", path, body, {"Content-Type": kind})
@@ -26,7 +26,7 @@ def ask(path: str, sent: Any = None, kind: str = "application/json") -> bytes:
 
 
 def serve() -> subprocess.Popen[bytes]:
-    """A server that answers, in a minute at most."""
+    """A server that answers within a minute."""
     log = (RESULTS / "served.log").open("a")
     server = subprocess.Popen(["cosim", "serve", "--data", "/results/served", "--workers", "2"], stderr=log)
     for _ in range(600):

@@ -11,16 +11,16 @@ from __future__ import annotations
 
 import argparse
 import tempfile
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
 
 from benchmarks.drives import Case, measure
-from benchmarks.full_roads import EACH, KINDS, FullRoad, full_roads
+from benchmarks.full_roads import EACH, KINDS, LARGEST, FullRoad, full_roads
 from benchmarks.tables import markdown_row, write_page
-from cosim.report.statistics import paired_change
-from sumo_scenarios.roads import NAMED
+from cosim.report.statistics import Figure, paired_change
 
 RESULTS = Path("docs/results")
 PAGE, DATA = "yielding.md", "data/yielding.csv"
@@ -67,34 +67,62 @@ def case(driver: str, road: FullRoad, duration: float | None) -> Case:
 def page(rows: Sequence[Drive]) -> list[str]:
     """The page: each rule beside the car, by kind of road."""
     of = {(row.driver, row.kind, row.seed): row for row in rows}
+    roads = Counter(row.kind for row in rows if row.driver == CAR)
     lines = [markdown_row(TABLE), "|---" * len(TABLE) + "|"]
-    for kind in ("all", *dict.fromkeys(row.kind for row in rows)):
-        for driver in DRIVERS:
-            lines += _lines(of, kind, driver)
-    count = len({row.seed for row in rows if row.driver == CAR})
-    return WORDS.format(table="\n".join(lines), count=count, each=count // len(NAMED), data=DATA).splitlines()
+    lines += [line for kind in (ALL, *roads) for rule in RULES for line in _lines(of, kind, rule)]
+    said = ", ".join(f"{count} {kind}" for kind, count in roads.items())
+    each, kinds = max(roads.values(), default=EACH), " ".join(roads)
+    return WORDS.format(
+        table="\n".join(lines),
+        answer=_answer(of),
+        roads=said,
+        each=each,
+        kinds=kinds,
+        largest=LARGEST,
+        data=DATA,
+    ).splitlines()
 
 
-TABLE = ["roads", "pairs", "driver", "delay of everybody, s", "change", "change of humans'", "hard brakings"]
+ALL, DELAY = "all", "total_delay_s"
+TABLE = ["roads", "pairs", "rule", "the car's delay, s", "the rule's", "change", "of humans' delay"]
+TABLE += ["hard brakings", "of the rule"]
 
 
-def _lines(of: dict[tuple[str, str, int], Drive], kind: str, driver: str) -> Iterator[str]:
-    """One driver's line on roads of one kind ("all": of every kind)."""
-    pairs = [
-        (of[CAR, k, seed], row)
-        for (d, k, seed), row in of.items()
-        if d == driver and kind in ("all", k) and (CAR, k, seed) in of
-    ]
+def _answer(of: dict[tuple[str, str, int], Drive]) -> str:
+    """Whether any rule saves delay over all roads."""
+    saves = [rule for rule in RULES if (pairs := _pairs(of, ALL, rule)) and _change(pairs, DELAY).high < 0.0]
+    if saves:
+        return f"**Yes:** everybody's delay falls with: {', '.join(saves)}."
+    return "**Not shown:** no rule's interval over all roads lies below 0."
+
+
+def _lines(of: dict[tuple[str, str, int], Drive], kind: str, rule: str) -> Iterator[str]:
+    """One rule's line on roads of one kind."""
+    pairs = _pairs(of, kind, rule)
     if not pairs:
         return
-    before, after = (list(side) for side in zip(*pairs, strict=True))
-    changes = ["", ""]
-    if driver != CAR:
-        for k, column in enumerate(("total_delay_s", "total_delay_hv_s")):
-            old, new = ([getattr(row, column) for row in side] for side in (before, after))
-            changes[k] = paired_change(old, new).text(0, 100.0) + " %"
-    delay, brakings = fmean(a.total_delay_s for a in after), fmean(a.hard_brakings_av for a in after)
-    yield markdown_row([kind, str(len(pairs)), driver, f"{delay:.1f}", *changes, f"{brakings:.0f}"])
+    means = (f"{fmean(side):.1f}" for side in _columns(pairs, DELAY))
+    changes = (_change(pairs, name).text(0, 100.0) + " %" for name in (DELAY, "total_delay_hv_s"))
+    hard = (f"{fmean(side):.0f}" for side in _columns(pairs, "hard_brakings_av"))
+    yield markdown_row([kind, str(len(pairs)), rule, *means, *changes, *hard])
+
+
+def _pairs(of: dict[tuple[str, str, int], Drive], kind: str, rule: str) -> list[tuple[Drive, Drive]]:
+    """The car's and the rule's drives on the same roads."""
+    return [
+        (of[CAR, k, seed], row)
+        for (driver, k, seed), row in of.items()
+        if driver == rule and kind in (ALL, k) and (CAR, k, seed) in of
+    ]
+
+
+def _columns(pairs: Sequence[tuple[Drive, Drive]], name: str) -> tuple[list[float], list[float]]:
+    before, after = zip(*((getattr(a, name), getattr(b, name)) for a, b in pairs), strict=True)
+    return [*before], [*after]
+
+
+def _change(pairs: Sequence[tuple[Drive, Drive]], name: str) -> Figure:
+    return paired_change(*_columns(pairs, name))
 
 
 WORDS = """# Is there anything to learn beyond the lawful car?
@@ -103,16 +131,18 @@ WORDS = """# Is there anything to learn beyond the lawful car?
 waited at a line. No vehicle is marked. Each row changes some of the rule's constants. Change is
 relative to the lawful car alone on the same roads, with 95 % intervals over roads.
 
+{answer}
+
 {table}
 
 ## Conditions
 
-{count} random roads of the validation seeds, equally many of each kind, whose demand is at least
-their nominal capacity ([formats](../reference/formats.md)), drivers `moderate`, errors `field`,
-20 % AVs, phi 45, sensing `ideal`. Rows: [{data}]({data}).
+Random roads of the validation seeds whose demand is at least their nominal capacity, and at most
+{largest:,.0f} vehicles/h ([formats](../reference/formats.md)): {roads}. Drivers
+`moderate`, errors `field`, 20 % AVs, phi 45, sensing `ideal`. Rows: [{data}]({data}).
 
 ```
-python -m benchmarks.yielding --each {each}
+python -m benchmarks.yielding --each {each} --kinds {kinds}
 ```
 """
 

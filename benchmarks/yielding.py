@@ -71,16 +71,9 @@ def page(rows: Sequence[Drive]) -> list[str]:
     lines = [markdown_row(TABLE), "|---" * len(TABLE) + "|"]
     lines += [line for kind in (ALL, *roads) for rule in RULES for line in _lines(of, kind, rule)]
     said = ", ".join(f"{count} {kind}" for kind, count in roads.items())
-    each, kinds = max(roads.values(), default=EACH), " ".join(roads)
-    return WORDS.format(
-        table="\n".join(lines),
-        answer=_answer(of),
-        roads=said,
-        each=each,
-        kinds=kinds,
-        largest=LARGEST,
-        data=DATA,
-    ).splitlines()
+    of_roads = {"roads": said, "each": max(roads.values(), default=EACH), "kinds": " ".join(roads)}
+    table, answer = "\n".join(lines), _answer(of)
+    return WORDS.format(table=table, answer=answer, largest=LARGEST, data=DATA, **of_roads).splitlines()
 
 
 ALL, DELAY = "all", "total_delay_s"
@@ -139,7 +132,8 @@ relative to the lawful car alone on the same roads, with 95 % intervals over roa
 
 Random roads of the validation seeds whose demand is at least their nominal capacity, and at most
 {largest:,.0f} vehicles/h ([formats](../reference/formats.md)): {roads}. Drivers
-`moderate`, errors `field`, 20 % AVs, phi 45, sensing `ideal`. Rows: [{data}]({data}).
+`moderate`, errors `field`, 20 % AVs, phi 45, sensing `ideal`. Rows:
+[{data}]({data}).
 
 ```
 python -m benchmarks.yielding --each {each} --kinds {kinds}

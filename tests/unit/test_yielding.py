@@ -1,4 +1,4 @@
-"""The search over scripted yielding: its constants exist, each rule is compared on the roads it shares with the car."""
+"""The search over scripted yielding: its constants exist, rules are paired with the car road by road."""
 
 from __future__ import annotations
 
@@ -34,9 +34,7 @@ def test_a_rule_is_compared_with_the_car_on_the_roads_that_both_drove() -> None:
     assert "**Yes:** everybody's delay falls with: as it ships." in text
 
 
-def test_the_roads_are_full_small_and_of_the_validation_seeds(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_the_roads_are_full_and_small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("benchmarks.full_roads.write", lambda seed, folder: folder / str(seed))
     roads = [*full_roads(2, tmp_path, ("weave", "minor"))]
     assert sorted(road.kind for road in roads) == ["minor", "minor", "weave", "weave"]

@@ -36,6 +36,8 @@ RULES: dict[str, dict[str, object]] = {
     "above 10 m/s, two between": {"LEAST_SPEED": 10.0, "MAX_BETWEEN": 2, "GAPS": (2.0, 80.0)},
     "above 10 m/s, 8 m/s slower": {"LEAST_SPEED": 10.0, "EASE": 8.0},
     "signals alone": {"PATIENCE": NEVER},
+    "4 m/s above the speed ahead": {"SURPLUS": 4.0},
+    "the same, no yielding": {"SURPLUS": 4.0, "MAX_BETWEEN": -1, "PATIENCE": NEVER},
     "lines after 15 s": {"PATIENCE": 15.0},
 }
 DRIVERS: dict[str, dict[str, Any]] = {

@@ -3,10 +3,13 @@
 It is the baseline of the learned altruist: whatever learning is worth must show beside it.
 """
 
+import math
 from collections.abc import Mapping
 
+import numpy as np
+
 from cosim.control import APPROACH_DECEL
-from cosim.types import Decision, History, MetaAction, ObservationConfig, PolicyContext
+from cosim.types import HEADING, SPEED, Decision, History, MetaAction, ObservationConfig, PolicyContext, X, Y
 from policy.agents.idm import Idm
 from policy.inputs.needs import Need, Needs
 
@@ -18,6 +21,9 @@ LEAST_SPEED = 0.0  # m/s, of a vehicle that signals: where traffic crawls, vehic
 PATIENCE = 5.0  # s that a vehicle has waited at its line before an AV with priority yields
 ARRIVAL = 8.0  # s until the AV's own arrival at the line, at least
 HOLD, REST = 8.0, 6.0  # s of yielding at most, and then without it
+SURPLUS = float("inf")  # m/s above the mean speed ahead, at most: a gentle arrival at a queue
+STRETCH, SIDE, LEAST_AHEAD = (20.0, 120.0), 8.0, 3  # m ahead and aside, and vehicles, of this mean
+SAME_WAY = 0.5  # rad, the largest difference of their headings to the AV's
 
 
 class YieldRule(Idm):
@@ -30,6 +36,7 @@ class YieldRule(Idm):
         """Start an episode: nobody has yielded yet."""
         super().reset(context)
         self._needs = Needs(context)
+        self._weight = min(math.tan(context.svo), 1.0)  # of others, as in the lawful car's courtesy
         self._began: dict[tuple[str, str], float] = {}  # (AV, vehicle) -> s, the begin of yielding
         self._rests: dict[str, float] = {}  # AV -> s, until then it does not begin to yield
 
@@ -39,8 +46,10 @@ class YieldRule(Idm):
         return {av: self._decision(history, needs.get(av, [])) for av, history in histories.items()}
 
     def _decision(self, history: History, needs: list[Need]) -> Decision:
+        if self._weight <= 0.0:
+            return Decision(MetaAction.ACCELERATE)
         speeds = [self._speed(history, need) for need in needs if self._yields(history, need)]
-        wanted = min(speeds, default=float("inf"))
+        wanted = min((*speeds, _mean_ahead(history) + SURPLUS))
         if wanted > history.ego_speed + EASE:
             return Decision(MetaAction.ACCELERATE)
         return Decision(MetaAction.IDLE, accel=wanted - history.ego_speed)
@@ -67,4 +76,12 @@ class YieldRule(Idm):
 
     def _speed(self, history: History, need: Need) -> float:
         """m/s"""
-        return need.gap / ARRIVAL if need.crossing else max(need.speed - EASE, 0.0)
+        return need.gap / ARRIVAL if need.crossing else max(need.speed - EASE * self._weight, 0.0)
+
+
+def _mean_ahead(history: History) -> float:
+    """The mean speed (m/s) of the vehicles ahead on all lanes of this direction; inf of too few."""
+    newest = history.kinematics[-1]
+    ahead = history.valid[-1] & (newest[:, X] > STRETCH[0]) & (newest[:, X] < STRETCH[1])
+    ahead &= (np.abs(newest[:, Y]) < SIDE) & (np.abs(newest[:, HEADING]) < SAME_WAY)
+    return float(newest[ahead, SPEED].mean()) if ahead.sum() >= LEAST_AHEAD else math.inf

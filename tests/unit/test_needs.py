@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from policy_scenes import LANE_WIDTH, Car, histories, straight_road
@@ -16,7 +19,7 @@ AV = Car("av", 300.0, 1, 20.0, is_av=True)
 
 
 def context(road: RoadMap) -> PolicyContext:
-    return PolicyContext(road, Timing(), COMPACT, 0.0, np.random.default_rng(0))
+    return PolicyContext(road, Timing(), COMPACT, math.pi / 4.0, np.random.default_rng(0))
 
 
 def signalling(scene: dict[str, History], **indicators: int) -> dict[str, History]:
@@ -106,6 +109,12 @@ def test_the_rule_eases_off_behind_it_until_it_has_had_its_time() -> None:
     later = {"av": scene["av"]._replace(time=HOLD + 0.1)}
     assert rule.decide(later)["av"].action == MetaAction.ACCELERATE
     assert rule.decide(later)["av"].accel is None
+
+
+def test_an_egoist_yields_to_nobody() -> None:
+    rule = YieldRule()
+    rule.reset(replace(context(ENDS), svo=0.0))
+    assert rule.decide(signalling(histories(ENDS, [AV, OTHER]), other=1))["av"].accel is None
 
 
 def test_the_rule_accelerates_beside_nobody_in_need() -> None:

@@ -283,7 +283,7 @@ class Getters:
 def test_the_compiled_getters_read_what_the_public_ones_do() -> None:
     with Worker(Getters, load("highway")) as worker:
         pairs = worker.call("read", "right.0")
-    assert len(pairs) == 8
+    assert len(pairs) == 9
     assert all(fast == slow for fast, slow in pairs)
 
 

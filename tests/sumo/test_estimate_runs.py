@@ -73,7 +73,7 @@ def test_a_run_grows_and_says_what_it_found(tilted: Path, capsys: pytest.Capture
     (cell,) = manifest["cells"].values()
     assert cell["case"]["tilt"] == cell["manifest"]["tilt"]
     assert run(f"estimate --resume --episodes 3 --out {tilted}") == 2
-    assert "it can grow" in capsys.readouterr().err
+    assert "it can only get more seeds" in capsys.readouterr().err
 
 
 def test_untilted_episodes_of_a_mixture_are_those_of_evaluate(tilted: Path, untilted: Path) -> None:
@@ -121,7 +121,7 @@ def test_without_a_tilt_nothing_is_weighed(
 def test_a_gate_holds_the_crash_rate(tilted: Path, capsys: pytest.CaptureFixture[str]) -> None:
     gate = "crash_rate_per_million_km.upper > 2"
     assert main(["compare", str(tilted), str(tilted), "--fail-on", gate]) == 1
-    assert "upper bound of" in capsys.readouterr().out
+    assert "no AV crashed" in capsys.readouterr().out
     assert main(["compare", str(tilted), str(tilted), "--fail-on", "crash_rate_per_million_km > +1"]) == 0
 
 

@@ -36,9 +36,9 @@ RULES: dict[str, dict[str, object]] = {
     "above 10 m/s, two between": {"LEAST_SPEED": 10.0, "MAX_BETWEEN": 2, "GAPS": (2.0, 80.0)},
     "above 10 m/s, 8 m/s slower": {"LEAST_SPEED": 10.0, "EASE": 8.0},
     "signals alone": {"PATIENCE": NEVER},
-    "4 m/s above the speed ahead": {"SURPLUS": 4.0},
-    "the same, no yielding": {"SURPLUS": 4.0, "MAX_BETWEEN": -1, "PATIENCE": NEVER},
-    "lines after 15 s": {"PATIENCE": 15.0},
+    "gentle arrival alone, 4 m/s": {"SURPLUS": 4.0, "MAX_BETWEEN": -1, "PATIENCE": NEVER},
+    "gentle arrival alone, 2 m/s": {"SURPLUS": 2.0, "MAX_BETWEEN": -1, "PATIENCE": NEVER},
+    "both, 4 m/s": {"SURPLUS": 4.0},
 }
 DRIVERS: dict[str, dict[str, Any]] = {
     CAR: {"policy": "car-alone"},
@@ -123,8 +123,9 @@ def _change(pairs: Sequence[tuple[Drive, Drive]], name: str) -> Figure:
 WORDS = """# Is there anything to learn beyond the lawful car?
 
 `yield-rule` eases off for a vehicle that signals onto the AV's lane, and for one that has long
-waited at a line. No vehicle is marked. Each row changes some of the rule's constants. Change is
-relative to the lawful car alone on the same roads, with 95 % intervals over roads.
+waited at a line. No vehicle is marked. Each row changes some of the rule's constants. With a gentle
+arrival the AV is at most so much faster than the traffic ahead. Change is relative to the lawful
+car alone on the same roads, with 95 % intervals over roads.
 
 {answer}
 

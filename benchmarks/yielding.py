@@ -1,7 +1,7 @@
 """Is there anything to learn? Scripted yielding beside the lawful car, on random roads that are full.
 
-    python -m benchmarks.yielding [--each N] [--rules NAME ...] [--duration S] [--workers N] [--again]
-                                  [--out docs/results]
+    python -m benchmarks.yielding [--each N] [--kinds KIND ...] [--rules NAME ...] [--duration S]
+                                  [--workers N] [--again] [--out docs/results]
 
 Each rule is `yield-rule` with some of its constants changed. All drive the same random validation roads.
 Rows are kept in docs/results/data/yielding.csv; the page is made of them.
@@ -40,10 +40,6 @@ RULES: dict[str, dict[str, object]] = {
     "gentle arrival alone, 2 m/s": {"SURPLUS": 2.0, "MAX_BETWEEN": -1, "PATIENCE": NEVER},
     "both, 4 m/s": {"SURPLUS": 4.0},
 }
-DRIVERS: dict[str, dict[str, Any]] = {
-    CAR: {"policy": "car-alone"},
-    **{rule: {"policy": "yield-rule"} for rule in RULES},
-}
 
 
 class Drive(NamedTuple):
@@ -61,7 +57,12 @@ class Drive(NamedTuple):
 def case(driver: str, road: FullRoad, duration: float | None) -> Case:
     """One episode; `duration`: s, None: to its end."""
     options: dict[str, Any] = {"penetration": 0.2, "behavior": "moderate", "errors": "field", "svo_deg": 45.0}
-    options |= {**DRIVERS[driver], "what": str(road.folder), "seed": road.seed, "duration": duration}
+    options |= {
+        "policy": "car-alone" if driver == CAR else "yield-rule",
+        "what": str(road.folder),
+        "seed": road.seed,
+        "duration": duration,
+    }
     constants = {f"{RULE}.{name}": value for name, value in RULES.get(driver, {}).items()}
     return Case((driver, road.kind, road.seed), options, constants)
 

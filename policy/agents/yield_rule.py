@@ -1,4 +1,4 @@
-"""A scripted rule that yields to whoever needs it, on any road, without a mark on any vehicle.
+"""A scripted rule that yields to vehicles that need it, on any road, without a mark on any vehicle.
 
 It is the baseline of the learned altruist: whatever learning is worth must show beside it.
 """
@@ -13,7 +13,7 @@ from cosim.types import HEADING, SPEED, Decision, History, MetaAction, Observati
 from policy.agents.idm import Idm
 from policy.inputs.needs import Need, Needs
 
-# When an AV yields and how much, chosen on validation roads (docs/results/yielding.md)
+# When an AV yields and how much, set by hand; docs/results/yielding.md compares other values
 GAPS = 2.0, 40.0  # m to its rear, at least and at most: an AV nearer would stand beside it
 MAX_BETWEEN = 0  # vehicles between both
 EASE = 4.0  # m/s below its speed
@@ -42,12 +42,12 @@ class YieldRule(Idm):
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
         """Accelerate, or the acceleration towards the lowest speed that any need asks for."""
+        if self._weight <= 0.0:
+            return dict.fromkeys(histories, Decision(MetaAction.ACCELERATE))
         needs = self._needs.find(histories)
         return {av: self._decision(history, needs.get(av, [])) for av, history in histories.items()}
 
     def _decision(self, history: History, needs: list[Need]) -> Decision:
-        if self._weight <= 0.0:
-            return Decision(MetaAction.ACCELERATE)
         speeds = [self._speed(history, need) for need in needs if self._yields(history, need)]
         wanted = min((*speeds, _mean_ahead(history) + SURPLUS))
         if wanted > history.ego_speed + EASE:
@@ -75,7 +75,7 @@ class YieldRule(Idm):
         return True
 
     def _speed(self, history: History, need: Need) -> float:
-        """m/s"""
+        """The speed (m/s) that a need asks for."""
         return need.gap / ARRIVAL if need.crossing else max(need.speed - EASE * self._weight, 0.0)
 
 

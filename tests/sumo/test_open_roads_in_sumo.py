@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from pathlib import Path
 
@@ -60,8 +61,9 @@ def test_a_drawn_road_is_driven(seed: int, tmp_path: Path) -> None:
     assert drive(scenario).validity == ()
 
 
-def test_a_vehicle_whose_lane_ends_signals_and_the_yield_rule_eases_off_for_it() -> None:
-    host = Host(load("open/on_ramp", demand=["over"], duration=100.0), "yield-rule", 0.0)
+@pytest.mark.parametrize("svo", [0.0, math.pi / 4.0])
+def test_a_vehicle_whose_lane_ends_signals_and_the_yield_rule_eases_off_unless_egoistic(svo: float) -> None:
+    host = Host(load("open/on_ramp", demand=["over"], duration=100.0), "yield-rule", svo)
     eased, signals = Counter[bool](), Counter[int]()
 
     class Watch(Hook):
@@ -71,8 +73,9 @@ def test_a_vehicle_whose_lane_ends_signals_and_the_yield_rule_eases_off_for_it()
 
     try:
         ends = [host.episode.simulator.road.index["joining_0"]]
-        run_episode(host.episode, host.policy, 100_000, svo=0.0, hooks=[Watch()])
+        run_episode(host.episode, host.policy, 100_000, svo=svo, hooks=[Watch()])
     finally:
         host.close()
     assert signals[1] > 0.9 * signals.total() > 0.0
-    assert eased[True] > 0
+    assert eased.total() > 0
+    assert (eased[True] > 0) == (svo > 0.0)

@@ -1,15 +1,17 @@
-"""Is there anything to learn? Scripted yielding beside the lawful car, on random roads that are full.
+"""Is there anything to learn? Scripted decisions beside the lawful car, on random roads that are full.
 
-    python -m benchmarks.yielding [--each N] [--kinds KIND ...] [--rules NAME ...] [--duration S]
-                                  [--workers N] [--again] [--out docs/results]
+    python -m benchmarks.yielding [--each N] [--kinds KIND ...] [--duration S] [--workers N] [--again]
+                                  [--out docs/results]
 
-Each rule is `yield-rule` with some of its constants changed. All drive the same random validation roads.
-Rows are kept in docs/results/data/yielding.csv; the page is made of them.
+A factorial experiment: on each random validation road, two random combinations of the habits of `yield-rule`
+and their complements are driven, so that each habit is on in two drives of four. Beside them stand the car
+alone, the rule as it ships, and SUMO's drivers. Rows are kept in docs/results/data/yielding.csv.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -20,32 +22,35 @@ from typing import Any, NamedTuple
 from benchmarks.drives import Case, measure
 from benchmarks.full_roads import EACH, KINDS, LARGEST, FullRoad, full_roads
 from benchmarks.tables import markdown_row, write_page
-from cosim.report.statistics import Figure, paired_change
+from cosim.report.statistics import Figure, mean, paired_change
+from cosim.seeding import generator
 
 RESULTS = Path("docs/results")
 PAGE, DATA = "yielding.md", "data/yielding.csv"
 RULE = "policy.agents.yield_rule"
-CAR = "the car"
-NEVER = float("inf")
-RULES: dict[str, dict[str, object]] = {
-    "as it ships": {},
-    "2 m/s slower": {"EASE": 2.0},
-    "8 m/s slower": {"EASE": 8.0},
-    "for 15 s": {"HOLD": 15.0, "REST": 0.0},
-    "for vehicles above 10 m/s": {"LEAST_SPEED": 10.0},
-    "above 10 m/s, two between": {"LEAST_SPEED": 10.0, "MAX_BETWEEN": 2, "GAPS": (2.0, 80.0)},
-    "above 10 m/s, 8 m/s slower": {"LEAST_SPEED": 10.0, "EASE": 8.0},
-    "signals alone": {"PATIENCE": NEVER},
-    "gentle arrival alone, 4 m/s": {"SURPLUS": 4.0, "MAX_BETWEEN": -1, "PATIENCE": NEVER},
-    "gentle arrival alone, 2 m/s": {"SURPLUS": 2.0, "MAX_BETWEEN": -1, "PATIENCE": NEVER},
-    "both, 4 m/s": {"SURPLUS": 4.0},
+HABITS = {  # what an AV does, and the constant that turns it on
+    "eases off for signals": "EASES_OFF",
+    "yields at lines": "YIELDS_AT_LINES",
+    "makes way": "MAKES_WAY",
+    "arrives gently": "ARRIVES_GENTLY",
+    "overtakes": "OVERTAKES",
 }
+CAR, SHIPPED = "the car alone", "`yield-rule`"
+DRIVERS: dict[str, dict[str, object]] = {
+    CAR: {"policy": "car-alone"},
+    SHIPPED: {"policy": "yield-rule"},
+    "`idm`": {"policy": "idm"},
+    "`idm-courteous`": {"policy": "idm-courteous"},
+    "no AVs": {"policy": "idm", "penetration": 0.0},
+}
+LETTERS = "abcde"  # of the habits
+ALL = "all"
 
 
 class Drive(NamedTuple):
     """A row of the CSV."""
 
-    driver: str
+    driver: str  # of `DRIVERS`, or the letters of the habits that are on
     kind: str  # of road
     seed: int  # of the road and of its traffic
     total_delay_s: float
@@ -54,83 +59,119 @@ class Drive(NamedTuple):
     hard_brakings_av: float
 
 
+def combinations(seed: int) -> Iterator[str]:
+    """The letters (a to e) of the habits that are on: two different combinations and their complements."""
+    half = 2 ** (len(LETTERS) - 1)
+    for number in generator(seed, "yielding").choice(half, 2, replace=False).tolist():
+        for bits in (number, 2 * half - 1 - number):
+            yield "".join(letter for k, letter in enumerate(LETTERS) if bits >> k & 1) or "-"
+
+
 def case(driver: str, road: FullRoad, duration: float | None) -> Case:
     """One episode; `duration`: s, None: to its end."""
     options: dict[str, Any] = {"penetration": 0.2, "behavior": "moderate", "errors": "field", "svo_deg": 45.0}
-    options |= {
-        "policy": "car-alone" if driver == CAR else "yield-rule",
-        "what": str(road.folder),
-        "seed": road.seed,
-        "duration": duration,
-    }
-    constants = {f"{RULE}.{name}": value for name, value in RULES.get(driver, {}).items()}
+    options |= {"policy": "yield-rule", "what": str(road.folder), "seed": road.seed, "duration": duration}
+    options |= DRIVERS.get(driver, {})
+    on = {} if driver in DRIVERS else dict(zip(LETTERS, HABITS.values(), strict=True))
+    constants = {f"{RULE}.{name}": letter in driver for letter, name in on.items()}
     return Case((driver, road.kind, road.seed), options, constants)
 
 
+def effect(rows: Sequence[Drive], letter: str) -> Figure:
+    """The relative change of everybody's delay by a habit: mean over roads, of drives with and without."""
+    changes = []
+    for seed in dict.fromkeys(row.seed for row in rows):
+        of = [row for row in rows if row.seed == seed and row.driver not in DRIVERS]
+        logs: list[list[float]] = [[], []]
+        for row in of:
+            logs[letter in row.driver].append(math.log(row.total_delay_s))
+        if all(logs):
+            changes.append(fmean(logs[True]) - fmean(logs[False]))
+    found = mean(changes)
+    return Figure(*(math.expm1(x) for x in (found.value, found.low, found.high)))
+
+
+# ---- the page ----
+
+
 def page(rows: Sequence[Drive]) -> list[str]:
-    """The page: each rule beside the car, by kind of road."""
-    of = {(row.driver, row.kind, row.seed): row for row in rows}
-    roads = Counter(row.kind for row in rows if row.driver == CAR)
-    lines = [markdown_row(TABLE), "|---" * len(TABLE) + "|"]
-    lines += [line for kind in (ALL, *roads) for rule in RULES for line in _lines(of, kind, rule)]
-    said = ", ".join(f"{count} {kind}" for kind, count in roads.items())
-    of_roads = {"roads": said, "each": max(roads.values(), default=EACH), "kinds": " ".join(roads)}
-    table, answer = "\n".join(lines), _answer(of)
-    return WORDS.format(table=table, answer=answer, largest=LARGEST, data=DATA, **of_roads).splitlines()
-
-
-ALL, DELAY = "all", "total_delay_s"
-TABLE = ["roads", "pairs", "rule", "the car's delay, s", "the rule's", "change", "of humans' delay"]
-TABLE += ["hard brakings", "of the rule"]
-
-
-def _answer(of: dict[tuple[str, str, int], Drive]) -> str:
-    """Whether any rule saves delay over all roads."""
-    saves = [rule for rule in RULES if (pairs := _pairs(of, ALL, rule)) and _change(pairs, DELAY).high < 0.0]
-    if saves:
-        return f"**Yes:** everybody's delay falls with: {', '.join(saves)}."
-    return "**Not shown:** no rule's interval over all roads lies below 0."
-
-
-def _lines(of: dict[tuple[str, str, int], Drive], kind: str, rule: str) -> Iterator[str]:
-    """One rule's line on roads of one kind."""
-    pairs = _pairs(of, kind, rule)
-    if not pairs:
-        return
-    means = (f"{fmean(side):.1f}" for side in _columns(pairs, DELAY))
-    changes = (_change(pairs, name).text(0, 100.0) + " %" for name in (DELAY, "total_delay_hv_s"))
-    hard = (f"{fmean(side):.0f}" for side in _columns(pairs, "hard_brakings_av"))
-    yield markdown_row([kind, str(len(pairs)), rule, *means, *changes, *hard])
-
-
-def _pairs(of: dict[tuple[str, str, int], Drive], kind: str, rule: str) -> list[tuple[Drive, Drive]]:
-    """The car's and the rule's drives on the same roads."""
-    return [
-        (of[CAR, k, seed], row)
-        for (driver, k, seed), row in of.items()
-        if driver == rule and kind in (ALL, k) and (CAR, k, seed) in of
+    """Effects by kind of road, then the drivers."""
+    roads = Counter(kind for kind, _ in {(row.kind, row.seed) for row in rows})
+    groups = {ALL: list(rows), **{kind: [row for row in rows if row.kind == kind] for kind in roads}}
+    effects = {
+        (habit, kind): effect(of, letter)
+        for letter, habit in zip(LETTERS, HABITS, strict=True)
+        for kind, of in groups.items()
+    }
+    head = ["", *groups]
+    table = [markdown_row(head), "|---" * len(head) + "|"]
+    table += [markdown_row([habit, *(_percent(effects[habit, kind]) for kind in groups)]) for habit in HABITS]
+    saves = [habit for habit in HABITS if effects[habit, ALL].high < 0.0]
+    costs = [habit for habit in HABITS if effects[habit, ALL].low > 0.0]
+    said = [
+        f"{' and '.join(names)} {verb} delay" for names, verb in ((saves, "saves"), (costs, "costs")) if names
     ]
+    answer = f"**Over all roads** {'; '.join(said) or 'no habit has an effect that is beyond chance'}."
+    return WORDS.format(
+        answer=answer,
+        effects="\n".join(table),
+        drivers="\n".join(_drivers(rows)),
+        largest=LARGEST,
+        roads=", ".join(f"{count} {kind}" for kind, count in sorted(roads.items())),
+        each=max(roads.values(), default=EACH),
+        kinds=" ".join(sorted(roads)),
+        data=DATA,
+    ).splitlines()
 
 
-def _columns(pairs: Sequence[tuple[Drive, Drive]], name: str) -> tuple[list[float], list[float]]:
-    before, after = zip(*((getattr(a, name), getattr(b, name)) for a, b in pairs), strict=True)
-    return [*before], [*after]
+def _percent(figure: Figure) -> str:
+    return "" if not figure.known else figure.text(0, 100.0) + " %"
 
 
-def _change(pairs: Sequence[tuple[Drive, Drive]], name: str) -> Figure:
-    return paired_change(*_columns(pairs, name))
+def _drivers(rows: Sequence[Drive]) -> Iterator[str]:
+    """Each driver beside the car on the same roads."""
+    head = ["", "roads", "delay, s", "change", "of humans' delay", "AVs' hard brakings", "AVs' collisions"]
+    yield markdown_row(head)
+    yield "|---" * len(head) + "|"
+    car = {row.seed: row for row in rows if row.driver == CAR}
+    for driver in DRIVERS:
+        of = [row for row in rows if row.driver == driver and row.seed in car]
+        if not of:
+            continue
+        beside = [car[row.seed] for row in of]
+        change = ["", ""]
+        if driver != CAR:
+            columns = ("total_delay_s", "total_delay_hv_s")
+            change = [
+                _percent(paired_change([getattr(a, c) for a in beside], [getattr(b, c) for b in of]))
+                for c in columns
+            ]
+        hard = "" if driver == "no AVs" else f"{fmean(row.hard_brakings_av for row in of):.0f}"
+        hits = "" if driver == "no AVs" else f"{sum(row.av_involved_collisions for row in of):.0f}"
+        delay = f"{fmean(row.total_delay_s for row in of):.1f}"
+        yield markdown_row([driver, str(len(of)), delay, *change, hard, hits])
 
 
 WORDS = """# Is there anything to learn beyond the lawful car?
 
-`yield-rule` eases off for a vehicle that signals onto the AV's lane, and for one that has long
-waited at a line. No vehicle is marked. Each row changes some of the rule's constants. With a gentle
-arrival the AV is at most so much faster than the traffic ahead. Change is relative to the lawful
-car alone on the same roads, with 95 % intervals over roads.
+An agent can yield more than the car does by itself, or change lanes, which the car does for its
+route alone. Each habit below is a few lines of [`yield-rule`](../reference/presets.md#policies),
+with constants set by hand. No vehicle is marked. On each road the same traffic meets AVs with and
+without the habit, in random combinations with the others.
 
 {answer}
 
-{table}
+## Change of everybody's delay by each habit
+
+{effects}
+
+Brackets hold 95 % intervals over roads.
+
+## Drivers on the same roads
+
+{drivers}
+
+Changes are relative to the car alone.
 
 ## Conditions
 
@@ -152,7 +193,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--each", type=int, default=EACH, metavar="N", help="roads of a kind")
     parser.add_argument("--kinds", nargs="*", default=KINDS, choices=KINDS, metavar="KIND")
-    parser.add_argument("--rules", nargs="*", default=[*RULES], choices=[*RULES], metavar="NAME")
     parser.add_argument("--duration", type=float, metavar="S", help="for a folder of its own")
     parser.add_argument("--workers", type=int, default=2, metavar="N")
     parser.add_argument("--again", action="store_true", help="also what is measured")
@@ -160,7 +200,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     args = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as folder:
         roads = [*full_roads(args.each, Path(folder), args.kinds)]
-        cases = [case(driver, road, args.duration) for road in roads for driver in (CAR, *args.rules)]
+        drivers = [(road, driver) for road in roads for driver in (*DRIVERS, *combinations(road.seed))]
+        cases = [case(driver, road, args.duration) for road, driver in drivers]
         rows = measure(Drive, cases, args.workers, args.out / DATA, args.again)
     write_page(args.out / PAGE, page(rows))
     print(args.out / PAGE)

@@ -9,7 +9,16 @@ from typing import NamedTuple
 
 from cosim.types import Decision, History, MetaAction, PolicyContext
 from policy.agents.idm import Idm, desired_gap
-from policy.inputs.conflict import CAR_LENGTH, LANE_WIDTH, Conflict, Seen, along, find_conflict, missions
+from policy.inputs.conflict import (
+    CAR_LENGTH,
+    LEFT,
+    Conflict,
+    Seen,
+    along,
+    find_conflict,
+    is_free,
+    missions,
+)
 
 # When the guide yields and how much; m, m/s
 MIN_LAG = -5.0  # a guide at most 5 m ahead of the mission vehicle can still fall back
@@ -19,10 +28,6 @@ MAX_UPSTREAM = 260.0
 CRAWL_SPEED = 2.0  # target speed of the guide upstream of a junction (on the grid: 0)
 PACE_SPEED_OFFSET = 5.0  # beside an ending lane: guide's speed below the mission vehicle's
 MIN_PACE_SPEED = 5.0  # lowest speed of the guide there
-MIN_CLEAR_GAP = 10.0  # a free left lane: space ahead and behind,
-CLEAR_TIME_GAP = 0.8  # s, plus this time gap to the follower,
-MAX_CLOSING_SPEED = 3.0  # m/s, largest speed of a follower above the guide's,
-CLOSING_TIME = 3.0  # s of closing speed added to the space
 
 
 class Need(NamedTuple):
@@ -104,7 +109,7 @@ class AltruistRule(Idm):
         if need.conflict.crossing:
             wanted = CRAWL_SPEED
         else:
-            if need.conflict.from_right and self._left_is_free(history):
+            if need.conflict.from_right and is_free(history, LEFT):
                 return MetaAction.LANE_LEFT
             wanted = max(need.conflict.speed - PACE_SPEED_OFFSET, MIN_PACE_SPEED)
         if history.lane_changing:
@@ -112,21 +117,6 @@ class AltruistRule(Idm):
         if history.target_speed > wanted + 2.5:
             return MetaAction.DECELERATE  # in a tight platoon too: braking opens the gap to the leader
         return None if self._too_close(history) else MetaAction.IDLE
-
-    def _left_is_free(self, history: History) -> bool:
-        """Whether the left lane has no vehicle beside the ego, no fast follower and no near leader."""
-        speed = history.ego_speed
-        left = history.route.paths[0]
-        if left is None or history.route.to_end(0) < 100.0 or history.lane_changing:
-            return False
-        for ahead, other in along(history, left, side=LANE_WIDTH):
-            if ahead < 0.0 and other - speed > MAX_CLOSING_SPEED:
-                return False  # a guide that has slowed down already stays in its lane
-            behind = MIN_CLEAR_GAP + other * CLEAR_TIME_GAP + max(other - speed, 0.0) * CLOSING_TIME
-            front = MIN_CLEAR_GAP + max(speed - other, 0.0) * CLOSING_TIME
-            if -behind < ahead < front:
-                return False
-        return True
 
     def _too_close(self, history: History) -> bool:
         """Whether the gap to the leader is below IDM's desired gap, even with a faster leader."""

@@ -11,19 +11,27 @@ import numpy as np
 from cosim.control import APPROACH_DECEL
 from cosim.types import HEADING, SPEED, Decision, History, MetaAction, ObservationConfig, PolicyContext, X, Y
 from policy.agents.idm import Idm
+from policy.inputs.conflict import LEFT, RIGHT, along, is_free
 from policy.inputs.needs import Need, Needs
 
-# When an AV yields and how much, set by hand; docs/results/yielding.md compares other values
-GAPS = 2.0, 40.0  # m to its rear, at least and at most: an AV nearer would stand beside it
-MAX_BETWEEN = 0  # vehicles between both
+# What the AV does; docs/results/yielding.md measures the effect of each
+EASES_OFF = True  # behind a vehicle that signals onto its lane
+YIELDS_AT_LINES = True  # to a vehicle that has long waited at a line where it gives way to the AV
+MAKES_WAY = False  # changes lanes away from a vehicle that signals onto its lane
+ARRIVES_GENTLY = False  # is not much faster than the traffic ahead
+OVERTAKES = False  # changes to a faster lane: egoists too
+
+# Set by hand
+GAPS = 2.0, 40.0  # m to the other's rear, at least and at most: an AV nearer would stand beside it
 EASE = 4.0  # m/s below its speed
-LEAST_SPEED = 0.0  # m/s, of a vehicle that signals: where traffic crawls, vehicles merge in turn anyway
-PATIENCE = 5.0  # s that a vehicle has waited at its line before an AV with priority yields
-ARRIVAL = 8.0  # s until the AV's own arrival at the line, at least
 HOLD, REST = 8.0, 6.0  # s of yielding at most, and then without it
-SURPLUS = float("inf")  # m/s above the mean speed ahead, at most: a gentle arrival at a queue
+PATIENCE = 5.0  # s that a vehicle has waited at its line
+ARRIVAL = 8.0  # s until the AV's own arrival at the line, at least
+SURPLUS = 4.0  # m/s above the mean speed of the traffic ahead
 STRETCH, SIDE, LEAST_AHEAD = (20.0, 120.0), 8.0, 3  # m ahead and aside, and vehicles, of this mean
 SAME_WAY = 0.5  # rad, the largest difference of their headings to the AV's
+GAIN, NEAR = 3.0, 80.0  # m/s that the other lane is faster, and m ahead that count
+SETTLE = 10.0  # s between two lane changes
 
 
 class YieldRule(Idm):
@@ -39,31 +47,32 @@ class YieldRule(Idm):
         self._weight = min(math.tan(context.svo), 1.0)  # of others, as in the lawful car's courtesy
         self._began: dict[tuple[str, str], float] = {}  # (AV, vehicle) -> s, the begin of yielding
         self._rests: dict[str, float] = {}  # AV -> s, until then it does not begin to yield
+        self._changes: dict[str, float] = {}  # AV -> s, until then it does not change lanes
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
         """Accelerate, or the acceleration towards the lowest speed that any need asks for."""
-        if self._weight <= 0.0:
-            return dict.fromkeys(histories, Decision(MetaAction.ACCELERATE))
-        needs = self._needs.find(histories)
+        needs = self._needs.find(histories) if self._weight > 0.0 else {}
         return {av: self._decision(history, needs.get(av, [])) for av, history in histories.items()}
 
     def _decision(self, history: History, needs: list[Need]) -> Decision:
         speeds = [self._speed(history, need) for need in needs if self._yields(history, need)]
-        wanted = min((*speeds, _mean_ahead(history) + SURPLUS))
-        if wanted > history.ego_speed + EASE:
-            return Decision(MetaAction.ACCELERATE)
-        return Decision(MetaAction.IDLE, accel=wanted - history.ego_speed)
+        if ARRIVES_GENTLY and self._weight > 0.0:
+            speeds.append(_mean_ahead(history) + SURPLUS)
+        wanted = min(speeds, default=math.inf)
+        accel = wanted - history.ego_speed if wanted <= history.ego_speed + EASE else None
+        change = self._change(history, needs)
+        if change is None:
+            change = MetaAction.ACCELERATE if accel is None else MetaAction.IDLE
+        return Decision(change, accel=accel)
 
     def _yields(self, history: History, need: Need) -> bool:
         """Whether the need is this AV's to serve, now, and not for too long."""
         av, now = history.ids[0], history.time
         if need.crossing:
             can_slow = history.ego_speed**2 < 2.0 * APPROACH_DECEL * need.gap
-            fits = can_slow and need.waited >= PATIENCE
+            fits = YIELDS_AT_LINES and can_slow and need.waited >= PATIENCE
         else:
-            fits = (
-                need.between <= MAX_BETWEEN and need.speed >= LEAST_SPEED and GAPS[0] <= need.gap <= GAPS[1]
-            )
+            fits = EASES_OFF and not need.between and GAPS[0] <= need.gap <= GAPS[1]
         began = self._began.get((av, need.vehicle))
         if not fits or (began is None and now < self._rests.get(av, 0.0)):
             return False
@@ -77,6 +86,33 @@ class YieldRule(Idm):
     def _speed(self, history: History, need: Need) -> float:
         """The speed (m/s) that a need asks for."""
         return need.gap / ARRIVAL if need.crossing else max(need.speed - EASE * self._weight, 0.0)
+
+    def _change(self, history: History, needs: list[Need]) -> MetaAction | None:
+        """A lane change that makes way, or gains speed; None without one."""
+        av, now = history.ids[0], history.time
+        if now < self._changes.get(av, 0.0):
+            return None
+        for side, action in ((LEFT, MetaAction.LANE_LEFT), (RIGHT, MetaAction.LANE_RIGHT)):
+            leaves = MAKES_WAY and any(_comes_from(1 - side, need) for need in needs)
+            gains = OVERTAKES and _speed_ahead(history, side) > _speed_ahead(history, 1) + GAIN
+            if (leaves or gains) and is_free(history, side):
+                self._changes[av] = now + SETTLE
+                return action
+        return None
+
+
+def _comes_from(side: int, need: Need) -> bool:
+    """Whether the vehicle is just ahead and signals from this side (1 right, -1 left)."""
+    return not need.crossing and need.from_right == (side > 0) and 0.0 <= need.gap <= GAPS[1]
+
+
+def _speed_ahead(history: History, side: int) -> float:
+    """The lowest speed (m/s) of the vehicles just ahead on a lane, at most the limit; 0 without a lane."""
+    path = history.route.paths[side]
+    if path is None:
+        return 0.0
+    speeds = [speed for ahead, speed in along(history, path) if 0.0 < ahead < NEAR]
+    return float(min([*speeds, history.route.speed_limit]))
 
 
 def _mean_ahead(history: History) -> float:

@@ -13,6 +13,12 @@ from cosim.types import IS_MISSION, Bools, Floats, Floats32, History, Ints
 
 LANE_WIDTH = 3.2  # m, SUMO's default
 CAR_LENGTH = 5.0  # m, SUMO's default passenger car
+LEFT, RIGHT = 0, 2  # of `RouteAhead.paths`
+MIN_CLEAR_GAP = 10.0  # m, a free lane: space ahead and behind,
+CLEAR_TIME_GAP = 0.8  # s, plus this time gap to the follower,
+MAX_CLOSING_SPEED = 3.0  # m/s, largest speed of a follower above the AV's,
+CLOSING_TIME = 3.0  # s of closing speed added to the space
+LEAST_LANE = 100.0  # m to the lane's dead end
 
 
 class Seen(NamedTuple):
@@ -67,6 +73,22 @@ def along(history: History, path: LanePath, side: float = 0.0) -> Floats:
     Upstream lanes have other indices, so vehicles behind are matched by position: `side` m to the left.
     """
     return _along(history.kinematics[-1], history.valid[-1], history.lane, path.next_lanes, side)
+
+
+def is_free(history: History, side: int) -> bool:
+    """Whether the lane on this side (`LEFT`, `RIGHT`) has no near leader, no one beside, no fast follower."""
+    speed = history.ego_speed
+    path = history.route.paths[side]
+    if path is None or history.route.to_end(side) < LEAST_LANE or history.lane_changing:
+        return False
+    for ahead, other in along(history, path, side=LANE_WIDTH if side == LEFT else -LANE_WIDTH):
+        if ahead < 0.0 and other - speed > MAX_CLOSING_SPEED:
+            return False  # an AV that has slowed down already stays in its lane
+        behind = MIN_CLEAR_GAP + other * CLEAR_TIME_GAP + max(other - speed, 0.0) * CLOSING_TIME
+        front = MIN_CLEAR_GAP + max(speed - other, 0.0) * CLOSING_TIME
+        if -behind < ahead < front:
+            return False
+    return True
 
 
 @compiled

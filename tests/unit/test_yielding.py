@@ -13,25 +13,34 @@ from cosim.seeding import TUNING_SEEDS
 from sumo_scenarios.draw import draw
 
 
-@pytest.mark.parametrize("changed", [constants for constants in yielding.RULES.values() if constants])
-def test_the_constants_that_are_changed_are_the_rules(changed: dict[str, object]) -> None:
+def test_each_habit_is_a_constant_of_the_rule() -> None:
     rule = importlib.import_module(yielding.RULE)
-    for name, value in changed.items():
-        assert type(getattr(rule, name)) is type(value)
-        assert getattr(rule, name) != value
+    assert all(isinstance(getattr(rule, constant), bool) for constant in yielding.HABITS.values())
+    assert len(yielding.LETTERS) == len(yielding.HABITS)
+
+
+@pytest.mark.parametrize("seed", range(100_000, 100_020))
+def test_each_habit_is_on_in_two_of_four_different_combinations(seed: int) -> None:
+    found = [*yielding.combinations(seed)]
+    assert len(set(found)) == 4
+    assert all(sum(letter in one for one in found) == 2 for letter in yielding.LETTERS)
 
 
 def row(driver: str, seed: int, delay: float) -> yielding.Drive:
     return yielding.Drive(driver, "weave", seed, delay, delay, 0, 10)
 
 
-def test_a_rule_is_compared_with_the_car_on_the_roads_that_both_drove() -> None:
-    rows = [row(yielding.CAR, seed, 50.0 + seed) for seed in range(8)]
-    rows += [row("as it ships", seed, 0.8 * (50.0 + seed)) for seed in range(6)]
-    text = "\n".join(yielding.page([*rows, row("for 15 s", 99, 1.0)]))
-    assert "| weave | 6 | as it ships | 52.5 | 42.0 | -20 (-20 to -20) % |" in text
-    assert "for 15 s" not in text
-    assert "**Yes:** everybody's delay falls with: as it ships." in text
+def test_the_effect_of_a_habit_is_that_of_drives_with_and_without_it_on_the_same_road() -> None:
+    rows = [
+        row(driver, seed, (10.0 + seed) * (0.8 if "b" in driver else 1.0) * (1.1 if "d" in driver else 1.0))
+        for seed in range(100_000, 100_008)
+        for driver in yielding.combinations(seed)
+    ]
+    rows += [row(yielding.CAR, seed, 1.0) for seed in range(100_000, 100_008)]
+    assert yielding.effect(rows, "b").value == pytest.approx(-0.2, abs=0.05)
+    text = "\n".join(yielding.page([*rows, row("`idm`", 100_000, 1.5)]))
+    assert "| `idm` | 1 | 1.5 | 50 % | 50 % | 10 | 0 |" in text
+    assert "yields at lines saves delay" in text
 
 
 def test_the_roads_are_full_and_small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

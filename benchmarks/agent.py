@@ -26,7 +26,7 @@ import numpy as np
 import torch
 
 from benchmarks.prediction_maps import AGENTS, DECISION, PENETRATION, Gatherer
-from benchmarks.tables import markdown_row, write_page
+from benchmarks.tables import markdown_head, markdown_row, write_page
 from cosim.host import Host
 from cosim.learning.configuration import configuration
 from cosim.learning.rollouts import Rollouts
@@ -170,7 +170,7 @@ def page(found: Mapping[str, Any], command: str) -> list[str]:
         ]
         columns = ("prediction", "values", "prioritizer", "decision", "processor time")
         heads = ["size", "threads", *columns, "target"]
-        lines += [markdown_row(heads), "|---" * len(heads) + "|"]
+        lines += markdown_head(heads)
         for size, by_threads in found["decisions"].items():
             for threads, parts in by_threads.items():
                 times = [f"{parts[name]:.1f}" for name in columns]

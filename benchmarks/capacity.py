@@ -27,7 +27,8 @@ from matplotlib.figure import Figure
 
 from benchmarks import published_capacity
 from benchmarks.drives import read
-from benchmarks.tables import markdown_row
+from benchmarks.tables import markdown_head, markdown_row
+from cosim.cli.arguments import seeds as seed_range
 from cosim.scenario import Scenario, load
 from cosim.scenario.vet import vetted
 from cosim.seeding import TUNING_SEEDS
@@ -240,9 +241,9 @@ def write(file: Path, rows: Sequence[Minute]) -> None:
 def page(rows: Sequence[Minute], picture: str) -> str:
     """The page."""
     names = [name for name in NAMED if drives(rows, name, RISING)]
-    table = [markdown_row(["road", *COLUMNS]), "|---" * (len(COLUMNS) + 1) + "|"]
+    table = markdown_head(["road", *COLUMNS])
     table += [markdown_row([f"`open/{name}`", *cells(rows, name)]) for name in names]
-    levels = [markdown_row(["road", *road_folders.LEVELS]), "|---" * (len(road_folders.LEVELS) + 1) + "|"]
+    levels = markdown_head(["road", *road_folders.LEVELS])
     for name in names:
         each = (f"{share * capacity(rows, name):,.0f}" for share in road_folders.LEVELS.values())
         levels.append(markdown_row([f"`open/{name}`", *each]))
@@ -336,15 +337,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     first = TUNING_SEEDS.start
     parser.add_argument("--roads", nargs="*", default=[*NAMED], choices=[*NAMED], metavar="NAME")
-    parser.add_argument("--seeds", default=f"{first}:{first + 3}", metavar="A:B")
+    parser.add_argument("--seeds", type=seed_range, default=f"{first}:{first + 3}", metavar="A:B")
     parser.add_argument("--again", action="store_true", help="also measure finished roads")
     parser.add_argument("--out", type=Path, default=RESULTS, metavar="FOLDER")
     args = parser.parse_args(arguments)
     data = args.out / DATA
-    rows, seeds = read(Minute, data), range(*map(int, args.seeds.split(":")))
+    rows = read(Minute, data)
     if args.again:
         rows = [row for row in rows if row.road not in args.roads]
-    measure(rows, args.roads, seeds, data)
+    measure(rows, args.roads, args.seeds, data)
     picture(rows, args.out / PICTURE)
     (args.out / PAGE).write_text(page(rows, PICTURE), encoding="utf-8")
     if args.out == RESULTS and not {*NAMED} - {row.road for row in rows}:

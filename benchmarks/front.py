@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.drives import Case, measure
 from benchmarks.full_roads import FullRoad, full_roads
-from benchmarks.tables import markdown_row, write_page
+from benchmarks.tables import markdown_head, markdown_row, write_page
 from cosim.report.statistics import Figure as Estimate
 from cosim.report.statistics import paired_change, pooled_rate
 from sumo_scenarios.roads import NAMED
@@ -130,7 +130,7 @@ def points(rows: Sequence[Drive]) -> Iterator[Point]:
 def page(rows: Sequence[Drive]) -> list[str]:
     """The page."""
     columns = ["", "delay, s", "change", "collisions", "caused by AVs", "hard brakings"]
-    lines = [markdown_row(columns), "|---" * len(columns) + "|"]
+    lines = markdown_head(columns)
     lines += [markdown_row([one.habit, *_cells(one)]) for one in points(rows)]
     count = len({row.seed for row in paired(rows).get(CAR, ())})
     of = {"count": count, "each": count // len(NAMED), "picture": PICTURE, "data": DATA}

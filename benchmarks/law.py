@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.tables import markdown_row, write_page
+from benchmarks.tables import markdown_head, markdown_row, write_page
 from cosim.batch.episode_runner import EpisodeRunner
 from cosim.report import statistics
 from cosim.scenario import Scenario
@@ -355,7 +355,7 @@ def _summary(cells: Mapping[tuple[float, str], Cell]) -> list[str]:
         columns = _columns(cell, cells[share, IDM], arm in FREE)
         shown = {name: text for name, (text, _) in columns.items() if name not in DETAILS}
         if not lines:
-            lines = [markdown_row(["AVs", "agent", *shown]), "|---" * (len(shown) + 2) + "|"]
+            lines = markdown_head(["AVs", "agent", *shown])
         lines.append(markdown_row([f"{share:.0%}", arm, *shown.values()]))
     return lines
 

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.tables import markdown_row, write_page
+from benchmarks.tables import markdown_head, markdown_row, write_page
 from cosim.episode import Episode, Hook, Step
 from cosim.geometry.raster import rasterize_road
 from cosim.host import Host
@@ -183,7 +183,7 @@ def page(result: Mapping[str, Mapping[str, Any]], command: str) -> list[str]:
         "",
     ]
     parts_of = list(next(iter(result.values()))["parts"])
-    lines += [markdown_row(["size", *parts_of, "real time"]), "|---" * (len(parts_of) + 2) + "|"]
+    lines += markdown_head(["size", *parts_of, "real time"])
     for name, found in result.items():
         spent = found["parts"]
         whole = _ratio(spent["whole prediction"]).split(", ")[1]
@@ -196,7 +196,7 @@ def page(result: Mapping[str, Mapping[str, Any]], command: str) -> list[str]:
         "",
     ]
     backends = list(next(iter(result.values()))["map branch"])
-    lines += [markdown_row(["size", *backends]), "|---" * (len(backends) + 1) + "|"]
+    lines += markdown_head(["size", *backends])
     lines += [
         markdown_row([name, *map(_ratio, found["map branch"].values())]) for name, found in result.items()
     ]

@@ -18,6 +18,7 @@ from statistics import fmean
 from typing import Any
 
 from benchmarks.tables import markdown_row
+from cosim.cli.arguments import seeds as seed_range
 from cosim.episode import Episode, Hook, Step
 from cosim.host import Host
 from cosim.metrics.standing import CLOSED, STANDSTILL
@@ -104,11 +105,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--av-type")
     parser.add_argument("--penetration", type=float)
     parser.add_argument("--policies", nargs="+", default=POLICIES)
-    parser.add_argument("--seeds", default="140000:140003")
+    parser.add_argument("--seeds", type=seed_range, default="140000:140003")
     parser.add_argument("--duration", type=float)
     parser.add_argument("--warmup", type=float)
     given = parser.parse_args(arguments)
-    seeds = range(*map(int, given.seeds.split(":")))
     found = {}
     for policy in given.policies:
         fleet = Fleet(penetration=0.0) if policy == NONE else Fleet(given.av_type, None, given.penetration)
@@ -116,7 +116,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             given.config, preset=Preset.LAWFUL, fleet=fleet, duration=given.duration, warmup=given.warmup,
             mission="none", traffic="controlled",
         )  # fmt: skip
-        found[policy] = drive(vetted(scenario), policy, seeds)
+        found[policy] = drive(vetted(scenario), policy, given.seeds)
     titles = list(next(iter(found.values())))
     print(markdown_row(["AVs", *titles]), markdown_row(["---"] * (len(titles) + 1)), sep="\n")
     for policy, row in found.items():

@@ -61,3 +61,8 @@ def write_page(path: Path | None, lines: Sequence[str]) -> None:
 def markdown_row(cells: Sequence[str]) -> str:
     """`| a | b |`"""
     return f"| {' | '.join(cells)} |"
+
+
+def markdown_head(columns: Sequence[str]) -> list[str]:
+    """The first two lines of a table."""
+    return [markdown_row(columns), "|---" * len(columns) + "|"]

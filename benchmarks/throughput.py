@@ -19,7 +19,8 @@ from typing import Any, NamedTuple
 
 from benchmarks.drives import Case, measure
 from benchmarks.real_nets import a10kw
-from benchmarks.tables import markdown_row, write_page
+from benchmarks.tables import markdown_head, markdown_row, write_page
+from cosim.cli.arguments import seeds as seed_range
 from cosim.report.statistics import paired_change
 
 RESULTS = Path("docs/results")
@@ -63,7 +64,7 @@ def page(rows: Sequence[Drive], duration: float) -> list[str]:
     """The page; `duration`: s of each drive."""
     columns = ["network", "seeds", "driver", "arrivals", "change", "total delay, s", "AVs stuck"]
     columns += ["collisions with an AV", "caused by AVs"]
-    lines = [markdown_row(columns), "|---" * len(columns) + "|"]
+    lines = markdown_head(columns)
     networks: list[str] = []
     for network in dict.fromkeys(row.network for row in rows):
         of = {(row.driver, row.seed): row for row in rows if row.network == network}
@@ -132,7 +133,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--seeds", default=f"{FIRST}:{FIRST + SEEDS}", metavar="A:B")
+    parser.add_argument("--seeds", type=seed_range, default=f"{FIRST}:{FIRST + SEEDS}", metavar="A:B")
     parser.add_argument("--nets", nargs="+", default=NETS, metavar="NAME")
     parser.add_argument("--config", nargs="+", type=Path, metavar="FILE")
     parser.add_argument(
@@ -143,7 +144,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=RESULTS, metavar="FOLDER")
     args = parser.parse_args(arguments)
     configs = args.config or [a10kw().with_name(f"{name}.sumocfg") for name in args.nets]
-    wanted = list(cases(configs, range(*map(int, args.seeds.split(":"))), bool(args.config), args.duration))
+    wanted = list(cases(configs, args.seeds, bool(args.config), args.duration))
     rows = measure(Drive, wanted, args.workers, args.out / DATA, args.again)
     write_page(args.out / PAGE, page(rows, args.duration))
     print(args.out / PAGE)

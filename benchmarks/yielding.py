@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 from benchmarks.drives import Case, measure
 from benchmarks.full_roads import EACH, KINDS, LARGEST, FullRoad, full_roads
-from benchmarks.tables import markdown_row, write_page
+from benchmarks.tables import markdown_head, markdown_row, write_page
 from cosim.report.statistics import Figure, mean, paired_change
 from cosim.seeding import generator
 
@@ -104,7 +104,7 @@ def page(rows: Sequence[Drive]) -> list[str]:
         for kind, of in groups.items()
     }
     head = ["", *groups]
-    table = [markdown_row(head), "|---" * len(head) + "|"]
+    table = markdown_head(head)
     table += [markdown_row([habit, *(_percent(effects[habit, kind]) for kind in groups)]) for habit in HABITS]
     saves = [habit for habit in HABITS if effects[habit, ALL].high < 0.0]
     costs = [habit for habit in HABITS if effects[habit, ALL].low > 0.0]
@@ -131,8 +131,7 @@ def _percent(figure: Figure) -> str:
 def _drivers(rows: Sequence[Drive]) -> Iterator[str]:
     """Each driver beside the car on the same roads."""
     head = ["", "roads", "delay, s", "change", "of humans' delay", "AVs' hard brakings", "AVs' collisions"]
-    yield markdown_row(head)
-    yield "|---" * len(head) + "|"
+    yield from markdown_head(head)
     car = {row.seed: row for row in rows if row.driver == CAR}
     for driver in DRIVERS:
         of = [row for row in rows if row.driver == driver and row.seed in car]

@@ -22,6 +22,7 @@ from pathlib import Path
 from sumo_scenarios import names
 
 RESULTS = Path("docs/results")
+APPROACHES = ("vfn-p", "vfn", "safe-dqn", "conv3d-dqn", "conv3d-a2c", "conv2d-dqn")  # of P's Table III
 REAL_NETS = "data/real_nets.csv"
 PREDICTED = (  # pictures and data of `cosim bench predict`
     *("position_error.png", "map_error.png", "hpn_training.png"),
@@ -54,6 +55,16 @@ def prediction(place: Place) -> list[list[str]]:
     if place.small:
         flags += ["--scenario", "merge", "--demand", "dense", "--policy", "idm"]
     return [["cosim.cli.main", "bench", "predict", *flags]]
+
+
+def attribution(place: Place) -> list[list[str]]:
+    """Which inputs the trained networks use."""
+    policies = APPROACHES[:1] if place.small else APPROACHES
+    flags = [word for policy in policies for word in ("--policy", policy)]
+    flags += ["--scenario", "merge", "--scenario", "intersection", "--demand", "contested"]
+    flags += ["--preset", "unguarded", "--seeds", "300000:300001" if place.small else "300000:300005"]
+    flags += ["--duration", "2"] if place.small else []
+    return [["cosim.cli.main", "bench", "attribution", *flags, "--out", str(place.work / "attribution")]]
 
 
 def prediction_speed(place: Place) -> list[list[str]]:
@@ -152,13 +163,13 @@ def capacity(place: Place) -> list[list[str]]:
 
 def front(place: Place) -> list[list[str]]:
     """Costs and benefits of each habit of the lawful car."""
-    few = ["--roads", "lane_drop", "--seeds", "100000:100001", "--duration", "30"] if place.small else []
+    few = ["--each", "1", "--habits", "the car", "--duration", "30"] if place.small else []
     return [["benchmarks.front", *few, "--out", str(place.out)]]
 
 
 def yielding(place: Place) -> list[list[str]]:
     """Scripted yielding beside the lawful car."""
-    few = ["--each", "1", "--rules", "as it ships", "--duration", "30"] if place.small else []
+    few = ["--each", "1", "--kinds", "weave", "--duration", "30"] if place.small else []
     return [["benchmarks.yielding", *few, "--out", str(place.out)]]
 
 
@@ -169,6 +180,12 @@ def throughput(place: Place) -> list[list[str]]:
 
 
 PAGES = (
+    Page(
+        "attribution",
+        attribution,
+        ("attribution.md", "attribution.png", "data/attribution.csv"),
+        drop=("*.md", "*.png", "*.csv"),
+    ),
     Page("capacity", capacity, ("capacity.md", "capacity.svg", "data/capacity.csv")),
     Page("front", front, ("front.md", "front.svg", "data/front.csv")),
     Page("yielding", yielding, ("yielding.md", "data/yielding.csv")),

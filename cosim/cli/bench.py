@@ -95,8 +95,7 @@ def _add_attribution(kinds: arguments.SubCommands) -> None:
     arguments.add(command, "--demand", default="")
     arguments.add(command, "--seeds", type=arguments.seeds, required=True)
     arguments.add(command, "--svo", default=45.0)
-    arguments.add(command, "--duration")
-    arguments.add(command, "--errors")
+    arguments.add(command, "--duration", "--errors", "--preset")
     command.add_argument(
         "--closed-loop", action="store_true", help="also drive whole episodes with each input replaced"
     )
@@ -123,7 +122,13 @@ def work_attribution(args: argparse.Namespace) -> int:
 
     out = prepare_folder(args.out)
     what = (args.policy, args.scenario, args.demand, args.seeds, args.svo, args.duration)
-    how = {"errors": args.errors, "closed_loop": args.closed_loop, "by": args.by, "workers": args.workers}
+    how = {
+        "errors": args.errors,
+        "preset": args.preset,
+        "closed_loop": args.closed_loop,
+        "by": args.by,
+        "workers": args.workers,
+    }
     how["replaced"] = args.replace or ()
     attribution(out, *what, **how, command="cosim " + shlex.join(sys.argv[1:]))
     print((out / PAGE).read_text(encoding="utf-8"))

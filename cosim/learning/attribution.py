@@ -1,5 +1,6 @@
 """`cosim bench attribution`: the effect of a value network's inputs on choices and on whole episodes."""
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple
 from itertools import groupby
@@ -31,6 +32,7 @@ SHARED = ("crashed", "mission_success")  # boolean figures of an episode, and nu
 FIGURES = ("mission_time_s", "av_near_misses_ttc", "hard_brakings_av", "dt_mean_m", "dt_av_m", "dt_mission_m")
 TESTED_FIGURE = "dt_mission_m"  # figure of the significance test
 NOTHING = "nothing", ""  # no replacement
+PANELS = 3  # of the picture, beside one another
 SHARES = ("choices_changed", "unmasked_changed")
 HEAD = (
     "| input | replacement | decisions | choices changed | best valued changed | mean abs dq | spread |",
@@ -100,6 +102,7 @@ def attribution(
     duration: float | None = None,
     *,
     errors: str | None = None,
+    preset: str | None = None,
     closed_loop: bool = False,
     by: str = TESTED_FIGURE,
     replaced: Sequence[str] = (),
@@ -110,7 +113,7 @@ def attribution(
 
     `closed_loop`: also drive every episode with each of `policy.attribution.replacements`; writes CLOSED_LOOP
     and a part of PAGE, with a test of the figure `by` per scenario. `replaced`: only these inputs. `errors`:
-    of the human drivers.
+    of the human drivers. `preset`: None for that of the scenario.
 
     Raises BadInput as `cosim.batch.record.planned`, for a policy without a value network, for a figure
     outside of FIGURES, and for an input that a policy does not have.
@@ -122,7 +125,7 @@ def attribution(
         for name in replaced:
             one_of(name, sorted(inputs), "--replace")
     asked = {"scenario": scenarios, "demand": demand or None, "policy": policies, "svo": svo_deg}
-    plan = planned(seeds, **asked, duration=duration, errors=errors)
+    plan = planned(seeds, **asked, duration=duration, errors=errors, preset=preset)
     tasks = [cell.task(case) for cell, case in plan.cases()]
     driven = spread(LocalEngine(Asking, workers=workers), tasks, "attribution")
     names = dict.fromkeys(episode["policy"] for episode in driven)
@@ -296,9 +299,11 @@ def markdown(
 def draw(path: Path, tables: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
     """Bars: share of changed choices by input and replacement, a panel per policy."""
     longest = max(map(len, tables.values()))
-    figure = Figure(figsize=(1.0 + 3.6 * len(tables), 1.0 + 0.22 * longest), layout="constrained")
-    panels = figure.subplots(1, len(tables), squeeze=False, sharex=True)[0]
-    for axis, (policy, rows) in zip(panels, tables.items(), strict=True):
+    columns = min(len(tables), PANELS)
+    lines = math.ceil(len(tables) / columns)
+    figure = Figure(figsize=(1.0 + 3.6 * columns, (1.0 + 0.22 * longest) * lines), layout="constrained")
+    panels = figure.subplots(lines, columns, squeeze=False, sharex=True).flat
+    for (policy, rows), axis in zip(tables.items(), panels, strict=False):
         names = [f"{row['input']}: {row['replacement']}" for row in rows]
         value, low, high = (
             100.0 * np.array([row[f"choices_changed{end}"] for row in rows]) for end in ("", "_low", "_high")
@@ -307,4 +312,6 @@ def draw(path: Path, tables: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
         axis.tick_params(axis="y", labelsize="x-small")
         axis.invert_yaxis()
         axis.set(title=policy, xlabel="choices changed, %")
+    for axis in panels:  # those without a policy
+        axis.remove()
     figure.savefig(path, dpi=110)

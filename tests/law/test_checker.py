@@ -340,6 +340,7 @@ def test_links_give_way_to_those_of_the_right_of_way_table(law_worlds: dict[str,
     assert any(wanted.values())
 
 
+@pytest.mark.soak
 def test_where_sumo_drives_nobody_passes_on_red_or_through_a_stop_sign(
     law_worlds: dict[str, Path],
 ) -> None:

@@ -54,6 +54,7 @@ def full_while_driven(small: Server, rest: Path, **asked: Any) -> str:
     return ""
 
 
+@pytest.mark.soak
 def test_a_disk_that_is_full_for_a_while_costs_no_run(server: Server, disk: Path, tmp_path: Path) -> None:
     seeds = {"seeds": "140000:140015"}
     undisturbed = server.submit(**SHORT, **seeds)

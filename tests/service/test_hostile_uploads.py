@@ -301,6 +301,7 @@ def test_many_bombs_at_once_leave_the_server_answering(server: Server) -> None:
     assert answers.count(422) >= 18
 
 
+@pytest.mark.soak
 def test_gzip_files_within_the_budget_are_driven_whatever_their_names(server: Server) -> None:
     files = {
         "run.sumocfg": CONFIG % (b"3", b""),

@@ -55,6 +55,7 @@ def operations(server: Server) -> dict[str, Any]:
     return {f"{op.method.upper()} {op.path}": op for op in (result.ok() for result in found)}
 
 
+@pytest.mark.soak
 def test_nothing_that_the_document_allows_is_a_server_error(
     operations: dict[str, Any], ids: dict[str, str]
 ) -> None:

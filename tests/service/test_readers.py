@@ -100,6 +100,7 @@ def opened(tmp_path_factory: pytest.TempPathFactory) -> list[Opened]:
     return [Opened(process, confined == "True", file) for process, confined, file in lines]
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("process", PROCESSES)
 def test_a_process_that_reads_an_upload_is_confined(opened: list[Opened], process: str) -> None:
     found = [one for one in opened if one.process == process]
@@ -107,5 +108,6 @@ def test_a_process_that_reads_an_upload_is_confined(opened: list[Opened], proces
     assert [one for one in found if not one.confined] == []
 
 
+@pytest.mark.soak
 def test_no_other_process_reads_an_upload(opened: list[Opened]) -> None:
     assert {one.process for one in opened} == set(PROCESSES)

@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks import measured
 
-IN_MAKE_TEST = ("law", "startup")  # one of the lawful car, one that drives the agent
+IN_MAKE_TEST = ("law",)
 
 
 @pytest.mark.parametrize(

@@ -222,6 +222,7 @@ def test_all_of_them_together_are_trained_with(
     assert "was trained with another configuration" in capsys.readouterr().err
 
 
+@pytest.mark.soak
 def test_an_encoder_is_trained_on_one_s_own_roads(
     own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -52,6 +52,8 @@ class YieldRule(Idm):
     def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
         """Accelerate, or the acceleration towards the lowest speed that any need asks for."""
         needs = self._needs.find(histories) if self._weight > 0.0 else {}
+        now = max((history.time for history in histories.values()), default=0.0)
+        self._began = {pair: began for pair, began in self._began.items() if now - began < HOLD + REST}
         return {av: self._decision(history, needs.get(av, [])) for av, history in histories.items()}
 
     def _decision(self, history: History, needs: list[Need]) -> Decision:

@@ -36,15 +36,17 @@ class Waiting:
     """The seconds that each known vehicle has stood: counted below `STANDING`, forgotten while it drives."""
 
     def __init__(self) -> None:
-        self._waited: dict[str, float] = {}
-        self._time: dict[str, float] = {}
+        self._known: dict[str, tuple[float, float]] = {}  # vehicle -> s that it has waited, at this time
 
     def update(self, vehicle: str, speed: float, time: float) -> float:
         """s that the vehicle has waited at `time` s; a vehicle out of sight keeps its count."""
-        past = time - self._time.get(vehicle, time)
-        waited = self._waited.get(vehicle, 0.0)
+        waited, last = self._known.get(vehicle, (0.0, time))
+        past = time - last
         waited = waited + past if speed < STANDING else max(waited - FORGET * past, 0.0)
-        self._time[vehicle], self._waited[vehicle] = time, waited
+        if speed < STANDING or waited > 0.0:
+            self._known[vehicle] = waited, time
+        else:
+            self._known.pop(vehicle, None)
         return waited
 
 

@@ -23,7 +23,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from benchmarks.drives import Case, measure
-from benchmarks.full_roads import FullRoad, full_roads
+from benchmarks.full_roads import LARGEST, FullRoad, full_roads
 from benchmarks.tables import markdown_head, markdown_row, write_page
 from cosim.report.statistics import Figure as Estimate
 from cosim.report.statistics import paired_change, pooled_rate
@@ -133,7 +133,7 @@ def page(rows: Sequence[Drive]) -> list[str]:
     lines = markdown_head(columns)
     lines += [markdown_row([one.habit, *_cells(one)]) for one in points(rows)]
     count = len({row.seed for row in paired(rows).get(CAR, ())})
-    of = {"count": count, "each": count // len(NAMED), "picture": PICTURE, "data": DATA}
+    of = {"largest": LARGEST, "count": count, "each": count // len(NAMED), "picture": PICTURE, "data": DATA}
     return WORDS.format(table="\n".join(lines), **of).splitlines()
 
 
@@ -148,7 +148,7 @@ def picture(rows: Sequence[Drive], file: Path) -> None:
     """Delay against collisions, a point a habit."""
     figure = Figure(figsize=(7.0, 4.4), layout="constrained")
     axes = figure.subplots()
-    for one in points(rows):
+    for number, one in enumerate(sorted(points(rows), key=lambda point: point.delay)):
         if math.isnan(one.hit.value):
             axes.axvline(one.delay, color="0.6", linestyle=":")
             axes.text(one.delay, 0.0, " no AVs", fontsize=8, color="0.4", va="bottom")
@@ -157,8 +157,14 @@ def picture(rows: Sequence[Drive], file: Path) -> None:
         mark = "o" if HABITS[one.habit].is_car else "s"
         colour = "C3" if one.habit == CAR else "C0" if mark == "o" else "0.5"
         axes.errorbar(one.delay, one.hit.value, [[below], [above]], fmt=mark, color=colour, elinewidth=0.6)
-        axes.annotate(one.habit.strip("`"), (one.delay, one.hit.value), (4, 4), textcoords="offset points")
+        axes.annotate(
+            one.habit.strip("`"),
+            (one.delay, one.hit.value),
+            (4, (4, -11)[number % 2]),
+            textcoords="offset points",
+        )
     axes.set_ylim(bottom=0.0)
+    axes.margins(x=0.15)  # for the last label
     axes.set_xlabel("mean delay of everybody, s")
     axes.set_ylabel("collisions with an AV in 1,000 AV-km")
     for text in axes.texts:
@@ -181,9 +187,9 @@ intervals over roads.
 ## Conditions
 
 {count} random roads of the validation seeds, equally many of each kind, whose demand is at least
-their nominal capacity ([formats](../reference/formats.md)), drivers `moderate`, 20 % AVs that
-always ask for more speed, sensing `ideal`. Test roads are not among them. Rows:
-[{data}]({data}).
+their nominal capacity, and at most {largest:,.0f} vehicles/h ([formats](../reference/formats.md)).
+Drivers `moderate`, 20 % AVs that always ask for more speed, sensing `ideal`. Test roads are not
+among them. Rows: [{data}]({data}).
 
 ```
 python -m benchmarks.front --each {each}

@@ -41,12 +41,13 @@ def write(claims: Sequence[Claim], out: Path) -> Path:
 
 
 def answer(claim: Claim, out: Path) -> str:
-    """Verdict and effects, from the first paragraph of the claim's page."""
+    """Verdict, verdicts by condition, and effects, from the first paragraph of the claim's page."""
     page = out / f"{claim.name}.md"
     text = page.read_text(encoding="utf-8") if page.is_file() else ""
     paragraphs = [" ".join(part.split()) for part in text.split("\n\n")]
-    found = re.match(r"\*\*([\w ]+\.)\*\* .*?: (difference to .*)\. By condition:", "".join(paragraphs[1:2]))
-    return f"**{found[1]}** {found[2]}" if found else NOT_DRIVEN
+    pattern = r"\*\*([\w ]+\.)\*\* .*?: (difference to .*)\. By condition: (.*)\."
+    found = re.match(pattern, "".join(paragraphs[1:2]))
+    return f"**{found[1]}** By condition: {found[3]}; {found[2]}" if found else NOT_DRIVEN
 
 
 def stale(claim: Claim, work: Work, out: Path) -> Iterator[str]:

@@ -85,8 +85,8 @@ def test_the_index_has_a_line_for_every_claim_and_says_what_is_not_driven(
     page.write(found, Settings(), tmp_path)
     text = index.write([found.claim, other], tmp_path).read_text()
     assert (
-        f"| {SMALL['sentence']} | ours | **Yes.** difference to `idm` -25.0 pp (-28.1 to -22.1), 800 pairs "
-        "| [small](small.md) |" in text
+        f"| {SMALL['sentence']} | ours | **Yes.** By condition: 2 yes; "
+        "difference to `idm` -25.0 pp (-28.1 to -22.1), 800 pairs | [small](small.md) |" in text
     )
     assert "| Nobody drove this | ours | Not driven yet. |  |" in text
     assert "All pages: [small](small.md)." in text

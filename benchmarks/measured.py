@@ -62,7 +62,7 @@ def attribution(place: Place) -> list[list[str]]:
     policies = APPROACHES[:1] if place.small else APPROACHES
     flags = [word for policy in policies for word in ("--policy", policy)]
     flags += ["--scenario", "merge", "--scenario", "intersection", "--demand", "contested"]
-    flags += ["--preset", "unguarded", "--seeds", "300000:300001" if place.small else "300000:300005"]
+    flags += ["--preset", "unguarded", "--seeds", "300000:300001" if place.small else "300000:300002"]
     flags += ["--duration", "2"] if place.small else []
     return [["cosim.cli.main", "bench", "attribution", *flags, "--out", str(place.work / "attribution")]]
 

@@ -45,6 +45,7 @@ DRIVERS: dict[str, dict[str, object]] = {
 }
 LETTERS = "abcde"  # of the habits
 ALL = "all"
+FEWEST = 24  # roads for an answer: the delay of one road changes by a third from drive to drive
 
 
 class Drive(NamedTuple):
@@ -106,12 +107,15 @@ def page(rows: Sequence[Drive]) -> list[str]:
     head = ["", *groups]
     table = markdown_head(head)
     table += [markdown_row([habit, *(_percent(effects[habit, kind]) for kind in groups)]) for habit in HABITS]
+    of_roads = sum(roads.values())
     saves = [habit for habit in HABITS if effects[habit, ALL].high < 0.0]
     costs = [habit for habit in HABITS if effects[habit, ALL].low > 0.0]
     said = [
         f"{' and '.join(names)} {verb} delay" for names, verb in ((saves, "saves"), (costs, "costs")) if names
     ]
     answer = f"**Over all roads** {'; '.join(said) or 'no habit has an effect that is beyond chance'}."
+    if of_roads < FEWEST:
+        answer = f"**Not decided:** {of_roads} roads are too few."
     return WORDS.format(
         answer=answer,
         effects="\n".join(table),

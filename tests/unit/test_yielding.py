@@ -33,14 +33,15 @@ def row(driver: str, seed: int, delay: float) -> yielding.Drive:
 def test_the_effect_of_a_habit_is_that_of_drives_with_and_without_it_on_the_same_road() -> None:
     rows = [
         row(driver, seed, (10.0 + seed) * (0.8 if "b" in driver else 1.0) * (1.1 if "d" in driver else 1.0))
-        for seed in range(100_000, 100_008)
+        for seed in range(100_000, 100_030)
         for driver in yielding.combinations(seed)
     ]
-    rows += [row(yielding.CAR, seed, 1.0) for seed in range(100_000, 100_008)]
+    rows += [row(yielding.CAR, seed, 1.0) for seed in range(100_000, 100_030)]
     assert yielding.effect(rows, "b").value == pytest.approx(-0.2, abs=0.05)
     text = "\n".join(yielding.page([*rows, row("`idm`", 100_000, 1.5)]))
     assert "| `idm` | 1 | 1.5 | 50 % | 50 % | 10 | 0 |" in text
     assert "yields at lines saves delay" in text
+    assert "**Not decided:** 2 roads are too few." in "\n".join(yielding.page(rows[:8]))
 
 
 def test_the_roads_are_full_and_small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

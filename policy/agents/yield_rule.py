@@ -95,7 +95,7 @@ class YieldRule(Idm):
         if now < self._changes.get(av, 0.0):
             return None
         for side, action in ((LEFT, MetaAction.LANE_LEFT), (RIGHT, MetaAction.LANE_RIGHT)):
-            leaves = MAKES_WAY and any(_comes_from(1 - side, need) for need in needs)
+            leaves = MAKES_WAY and any(_is_left_for(side, need) for need in needs)
             gains = OVERTAKES and _speed_ahead(history, side) > _speed_ahead(history, 1) + GAIN
             if (leaves or gains) and is_free(history, side):
                 self._changes[av] = now + SETTLE
@@ -103,9 +103,9 @@ class YieldRule(Idm):
         return None
 
 
-def _comes_from(side: int, need: Need) -> bool:
-    """Whether the vehicle is just ahead and signals from this side (1 right, -1 left)."""
-    return not need.crossing and need.from_right == (side > 0) and 0.0 <= need.gap <= GAPS[1]
+def _is_left_for(side: int, need: Need) -> bool:
+    """Whether the vehicle is just ahead and signals from the other side than this one (`LEFT`, `RIGHT`)."""
+    return not need.crossing and need.from_right == (side == LEFT) and 0.0 <= need.gap <= GAPS[1]
 
 
 def _speed_ahead(history: History, side: int) -> float:

@@ -37,7 +37,10 @@ def test_the_effect_of_a_habit_is_that_of_drives_with_and_without_it_on_the_same
         for driver in yielding.combinations(seed)
     ]
     rows += [row(yielding.CAR, seed, 1.0) for seed in range(100_000, 100_030)]
-    assert yielding.effect(rows, "b").value == pytest.approx(-0.2, abs=0.05)
+    found = yielding.effects(rows)
+    assert {letter: one.value for letter, one in found.items()} == pytest.approx(
+        {"a": 0.0, "b": -0.2, "c": 0.0, "d": 0.1, "e": 0.0}, abs=1e-6
+    )
     text = "\n".join(yielding.page([*rows, row("`idm`", 100_000, 1.5)]))
     assert "| `idm` | 1 | 1.5 | 50 % | 50 % | 10 | 0 |" in text
     assert "yields at lines saves delay" in text

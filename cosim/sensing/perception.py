@@ -221,6 +221,9 @@ class Percepts(Mapping[str, Percept]):
             self._found[av] = self._percept(self._avs[av])
         return self._found[av]
 
+    def __contains__(self, av: object) -> bool:
+        return av in self._avs
+
     def __iter__(self) -> Iterator[str]:
         return iter(self._avs)
 

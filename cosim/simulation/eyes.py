@@ -77,12 +77,10 @@ class Eyes:
         return [name for name in self._vehicles if name not in view.rows and name != av]
 
     def _percept_view(self, av: str) -> "View | None":
-        truth = self._truth
-        if truth is None or truth.percepts is None or av not in truth.percepts:
-            return None
-        if av not in self._views:
-            self._views[av] = View(self._road, av, truth, truth.percepts[av])
-        return self._views[av]
+        view, truth = self._views.get(av), self._truth
+        if view is None and truth is not None and truth.percepts is not None and av in truth.percepts:
+            view = self._views[av] = View(self._road, av, truth, truth.percepts[av])
+        return view
 
 
 class View:

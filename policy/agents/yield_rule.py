@@ -8,7 +8,6 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from cosim.control import APPROACH_DECEL
 from cosim.types import HEADING, SPEED, Decision, History, MetaAction, ObservationConfig, PolicyContext, X, Y
 from policy.agents.idm import Idm
 from policy.inputs.conflict import LEFT, RIGHT, along, is_free
@@ -26,7 +25,9 @@ GAPS = 2.0, 40.0  # m to the other's rear, at least and at most: an AV nearer wo
 EASE = 4.0  # m/s below its speed
 HOLD, REST = 8.0, 6.0  # s of yielding at most, and then without it
 PATIENCE = 5.0  # s that a vehicle has waited at its line
-ARRIVAL = 8.0  # s until the AV's own arrival at the line, at least
+HOLD_AT_LINE = 60.0  # s of yielding at a line at most
+UPSTREAM = 80.0  # m before its line, where the AV begins at the latest: nearer, it would close the gap itself
+CRAWL = 2.0  # m/s, of the AV while it lets a vehicle go
 SURPLUS = 4.0  # m/s above the mean speed of the traffic ahead
 STRETCH, SIDE, LEAST_AHEAD = (20.0, 120.0), 8.0, 3  # m ahead and aside, and vehicles, of this mean
 SAME_WAY = 0.5  # rad, the largest difference of their headings to the AV's
@@ -47,13 +48,17 @@ class YieldRule(Idm):
         self._weight = min(math.tan(context.svo), 1.0)  # of others, as in the lawful car's courtesy
         self._began: dict[tuple[str, str], float] = {}  # (AV, vehicle) -> s, the begin of yielding
         self._rests: dict[str, float] = {}  # AV -> s, until then it does not begin to yield
+        self._guides: dict[tuple[str, int], str] = {}  # (waiting vehicle, link) -> the AV that lets it go
         self._changes: dict[str, float] = {}  # AV -> s, until then it does not change lanes
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
         """Accelerate, or the acceleration towards the lowest speed that any need asks for."""
         needs = self._needs.find(histories) if self._weight > 0.0 else {}
         now = max((history.time for history in histories.values()), default=0.0)
-        self._began = {pair: began for pair, began in self._began.items() if now - began < HOLD + REST}
+        self._began = {
+            pair: began for pair, began in self._began.items() if now - began < HOLD_AT_LINE + REST
+        }
+        self._guides = self._chosen(histories, needs)
         return {av: self._decision(history, needs.get(av, [])) for av, history in histories.items()}
 
     def _decision(self, history: History, needs: list[Need]) -> Decision:
@@ -67,19 +72,32 @@ class YieldRule(Idm):
             change = MetaAction.ACCELERATE if accel is None else MetaAction.IDLE
         return Decision(change, accel=accel)
 
+    def _chosen(
+        self, histories: Mapping[str, History], needs: Mapping[str, list[Need]]
+    ) -> dict[tuple[str, int], str]:
+        """For each waiting vehicle and each way across it, the AV that lets it go: the nearest that can."""
+        found: dict[tuple[str, int], tuple[bool, float, str]] = {}
+        for av, of in needs.items():
+            for need in of:
+                key = need.vehicle, need.link
+                held = self._guides.get(key) == av
+                begins = need.crossing and need.waited >= PATIENCE and need.gap >= UPSTREAM
+                if held or begins:
+                    found[key] = min(found.get(key, (True, math.inf, av)), (not held, need.gap, av))
+        return {key: av for key, (_, _, av) in found.items()}
+
     def _yields(self, history: History, need: Need) -> bool:
         """Whether the need is this AV's to serve, now, and not for too long."""
         av, now = history.ids[0], history.time
         if need.crossing:
-            can_slow = history.ego_speed**2 < 2.0 * APPROACH_DECEL * need.gap
-            fits = YIELDS_AT_LINES and can_slow and need.waited >= PATIENCE
+            fits = YIELDS_AT_LINES and self._guides.get((need.vehicle, need.link)) == av
         else:
             fits = EASES_OFF and not need.between and GAPS[0] <= need.gap <= GAPS[1]
         began = self._began.get((av, need.vehicle))
         if not fits or (began is None and now < self._rests.get(av, 0.0)):
             return False
         began = self._began.setdefault((av, need.vehicle), now)
-        if now - began > HOLD:
+        if now - began > (HOLD_AT_LINE if need.crossing else HOLD):
             self._rests[av] = now + REST
             del self._began[av, need.vehicle]
             return False
@@ -87,7 +105,7 @@ class YieldRule(Idm):
 
     def _speed(self, history: History, need: Need) -> float:
         """The speed (m/s) that a need asks for."""
-        return need.gap / ARRIVAL if need.crossing else max(need.speed - EASE * self._weight, 0.0)
+        return CRAWL if need.crossing else max(need.speed - EASE * self._weight, 0.0)
 
     def _change(self, history: History, needs: list[Need]) -> MetaAction | None:
         """A lane change that makes way, or gains speed; None without one."""

@@ -30,6 +30,7 @@ class Need(NamedTuple):
     remaining: float  # m, left to the vehicle before its line, or the end of its lane (inf: it does not end)
     waited: float  # s (`Waiting`)
     from_right: bool = False  # it signals from the right of the AV's lane
+    link: int = -1  # (crossing) the AV's way over the line: `RoadMap.links`
 
 
 class Waiting:
@@ -83,7 +84,7 @@ class Needs:
             waited = waiting.update(history.ids[row], speed, history.time)
             need = None
             if lane in lines:
-                need = self._crossing(history, row, waited, lines[lane])
+                need = self._crossing(history, row, waited, *lines[lane])
             elif len(history.indicator) and history.indicator[row]:
                 need = self._merging(history, own, row, waited)
             if need is not None:
@@ -106,18 +107,18 @@ class Needs:
         left = theirs.length - place if theirs.dead_end else np.inf
         return Need(history.ids[row], False, gap, between, float(newest[SPEED]), left, waited, right)
 
-    def _crossing(self, history: History, row: int, waited: float, line: float) -> Need | None:
+    def _crossing(self, history: History, row: int, waited: float, line: float, link: int) -> Need | None:
         """The need of a vehicle that gives way to the AV, whose own line is `line` m ahead."""
         remaining = self._road.lanes[int(history.lane[row])].length - float(history.lane_position[row])
         if remaining > LINE_RANGE:
             return None
         speed = float(history.kinematics[-1, row, SPEED])
-        return Need(history.ids[row], True, line, 0, speed, remaining, waited)
+        return Need(history.ids[row], True, line, 0, speed, remaining, waited, link=link)
 
-    def _lines_ahead(self, history: History, own: LanePath) -> dict[int, float]:
-        """Lanes whose vehicles give way to this AV -> m to the AV's line there."""
+    def _lines_ahead(self, history: History, own: LanePath) -> dict[int, tuple[float, int]]:
+        """Lanes whose vehicles give way to this AV -> m to the AV's line there, and its link over it."""
         front = history.route.arc + 0.5 * float(history.kinematics[-1, 0, LENGTH])
-        found: dict[int, float] = {}
+        found: dict[int, tuple[float, int]] = {}
         for (lane, following), start in zip(pairwise(own.lanes), own.lane_start[1:].tolist(), strict=True):
             line = start - front
             if line > AHEAD_RANGE:
@@ -125,7 +126,7 @@ class Needs:
             link = self._road.link_of.get((lane, following))
             if link is not None and line > 0.0:
                 for origin in self._yielding.get(link, ()):
-                    found.setdefault(origin, line)
+                    found.setdefault(origin, (line, link))
         return found
 
 

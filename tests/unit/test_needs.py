@@ -12,7 +12,7 @@ from policy_scenes import LANE_WIDTH, Car, histories, straight_road
 from cosim.road import Lane, Link, RoadMap, Rule
 from cosim.types import COMPACT, History, MetaAction, PolicyContext, Timing
 from policy.agents import yield_rule
-from policy.agents.yield_rule import EASE, HOLD, PATIENCE, YieldRule
+from policy.agents.yield_rule import CRAWL, EASE, HOLD, PATIENCE, UPSTREAM, YieldRule
 from policy.inputs.needs import Need, Needs
 
 ENDS = straight_road(dead_end=0)  # the right lane ends at x = 400
@@ -89,7 +89,7 @@ def test_a_vehicle_that_gives_way_to_the_av_needs_it_the_more_the_longer_it_has_
     assert of.find(at_line(road, 0.0))["av"][0].waited == 0.0
     (need,) = of.find(at_line(road, 3.0))["av"]
     assert need == Need(
-        "waits", True, pytest.approx(197.5), 0, 0.0, pytest.approx(2.0), waited=pytest.approx(3.0)
+        "waits", True, pytest.approx(197.5), 0, 0.0, pytest.approx(2.0), pytest.approx(3.0), link=0
     )
 
 
@@ -149,11 +149,31 @@ def test_the_rule_accelerates_beside_nobody_in_need() -> None:
     assert rule.decide(histories(ENDS, [AV]))["av"].accel is None
 
 
-def test_the_rule_arrives_later_for_one_that_has_waited_long() -> None:
+def test_the_rule_crawls_far_before_the_line_for_one_that_has_waited_long_until_it_is_gone() -> None:
     road = crossing_road(Rule.YIELD)
     rule = YieldRule()
     rule.reset(context(road))
-    assert rule.decide(at_line(road, 0.0))["av"].accel is None
-    near = at_line(road, PATIENCE)["av"]
-    close = near._replace(route=near.route._replace(arc=340.0))
-    assert rule.decide({"av": close})["av"].accel == pytest.approx((400.0 - 342.5) / 8.0 - 15.0)
+    crawls, drives = pytest.approx(CRAWL - 15.0), None
+
+    def wish(waited: float, arc: float) -> float | None:
+        of = at_line(road, waited)["av"]
+        return rule.decide({"av": of._replace(route=of.route._replace(arc=arc))})["av"].accel
+
+    assert wish(0.0, 200.0) == drives
+    assert wish(PATIENCE, 400.0 - UPSTREAM) == drives  # too near to let it go
+    assert wish(PATIENCE, 200.0) == crawls
+    assert wish(PATIENCE + 10.0, 400.0 - 0.5 * UPSTREAM) == crawls  # it has begun
+    alone = histories(road, [Car("av", 300.0, 0, 15.0, is_av=True)])["av"]
+    assert rule.decide({"av": alone._replace(time=PATIENCE + 11.0)})["av"].accel == drives
+
+
+def test_one_av_of_a_lane_lets_a_waiting_vehicle_go() -> None:
+    road = crossing_road(Rule.YIELD)
+    rule = YieldRule()
+    rule.reset(context(road))
+    rule.decide(at_line(road, 0.0))
+    first = at_line(road, PATIENCE)["av"]
+    behind = first._replace(ids=("behind", *first.ids[1:]), route=first.route._replace(arc=150.0))
+    decisions = rule.decide({"behind": behind, "av": first})
+    assert decisions["av"].accel is not None
+    assert decisions["behind"].accel is None

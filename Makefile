@@ -12,7 +12,7 @@ WORKERS ?= 2
 SAMPLE ?= 20
 PROCESSES ?= 2
 # The tests of a file stay in one process, in the order of the folders, long files first. One thread per process.
-PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(PROCESSES) --dist loadfile --no-loadscope-reorder --durations=150 --durations-min=2
+PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(PROCESSES) --dist loadfile --no-loadscope-reorder --durations=40 --durations-min=2
 
 .PHONY: demo test soak docs quick pytest unit check kernels nets results pages results-small audit image smoke clean
 

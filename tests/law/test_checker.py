@@ -363,6 +363,7 @@ def keep_lane(worlds: dict[str, Path], names: Sequence[str], seeds: int) -> list
     return [case for case in found if case.policy == "keep-lane"]
 
 
+@pytest.mark.soak
 def test_on_keep_lane_the_checker_counts_what_the_figures_count(law_worlds: dict[str, Path]) -> None:
     rows = driven(keep_lane(law_worlds, NAMES, 1), 1, None, None)
 

@@ -146,6 +146,7 @@ def test_a_request_that_is_too_large_is_refused(server: Server) -> None:
     assert server.http.post("/api/runs", content=endless()).status_code == 413
 
 
+@pytest.mark.soak
 def test_a_killed_server_loses_no_run_and_drives_none_twice(tmp_path_factory: pytest.TempPathFactory) -> None:
     data = tmp_path_factory.mktemp("killed") / "data"
     url = os.environ.get("COSIM_TEST_DATABASE")  # an empty PostgreSQL, in place of SQLite

@@ -275,6 +275,7 @@ def test_an_episode_of_a_world_that_ships_has_an_end(client: httpx.Client, path:
 
 
 # Twice to thrice what a session's imports take.
+@pytest.mark.soak
 @pytest.mark.parametrize("limits", [Limits(cpu=6.0, free=1)], indirect=True)
 def test_an_episode_of_a_world_that_ships_has_so_much_processor_time(client: httpx.Client) -> None:
     run = client.post("/api/runs", json={**SHORT, "duration": 80_000}).json()["id"]

@@ -42,7 +42,7 @@ def test_gymnasium_drives_several_at_once(mode: str, tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize("kind", ["SubprocVecEnv", "DummyVecEnv"])
+@pytest.mark.parametrize("kind", [pytest.param("SubprocVecEnv", marks=pytest.mark.soak), "DummyVecEnv"])
 def test_stable_baselines_learns_in_several_at_once(kind: str, tmp_path: Path) -> None:
     code = documented("make_vec_env(").replace("SubprocVecEnv", kind)
     run(code + f"assert type(envs).__name__ == '{kind}'\nassert model.num_timesteps == 64\n", tmp_path)

@@ -247,6 +247,7 @@ def test_a_batch_compares_ones_own_with_ours_and_knows_when_it_was_changed(
     assert "own_policy.py: policy='mine': has changed in a worker: " in capsys.readouterr().err
 
 
+@pytest.mark.soak
 def test_what_stable_baselines_learned_drives_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = tmp_path / "dqn.zip"
     train = [sys.executable, str(EXAMPLES / "train_sb3_dqn.py"), "--steps", "40", "--episodes", "1"]

@@ -13,7 +13,7 @@ from sumo_scenarios.roads import NAMED
 
 FULL = 1.0  # share of the nominal capacity that is wanted at least
 LARGEST = 2500.0  # vehicles/h wanted at most: a drive of twice the vehicles costs more than two drives show
-EACH = 6  # roads of a kind
+EACH = 4  # roads of a kind
 KINDS = tuple(NAMED)
 
 

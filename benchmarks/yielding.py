@@ -47,7 +47,9 @@ DRIVERS: dict[str, dict[str, object]] = {
 }
 LETTERS = "abcde"  # of the habits
 ALL = "all"
-FEWEST = 24  # roads for an answer: the delay of one road changes by a third from drive to drive
+FEWEST = EACH * len(
+    KINDS
+)  # roads for an answer: the delay of one road changes by a third from drive to drive
 
 
 class Drive(NamedTuple):

@@ -50,8 +50,8 @@ LIMITS = {
     "maps only": "Has no other inputs than maps.",
     "one seed": "Was trained once, from one seed, in preset `unguarded`, with human drivers without errors. "
     "The difference to another seed is not measured.",
-    "two seeds": "Was trained twice, from two seeds, in preset `unguarded`, with human drivers without errors. "
-    "The better one in validation ships; the [learning curves](../results/learning.md) show both.",
+    "two seeds": "Was trained twice, from two seeds, in preset `unguarded`, with human drivers without "
+    "errors. The better one in validation ships; the [learning curves](../results/learning.md) show both.",
     "scenarios": "Was trained on the shipped scenarios only, with drivers that follow IDM and LC2013 or "
     "MOBIL, without errors. Its error on recorded traffic or on other roads is unknown.",
 }

@@ -47,9 +47,8 @@ DRIVERS: dict[str, dict[str, object]] = {
 }
 LETTERS = "abcde"  # of the habits
 ALL = "all"
-FEWEST = EACH * len(
-    KINDS
-)  # roads for an answer: the delay of one road changes by a third from drive to drive
+# Roads for an answer: the delay of one road changes by a third from drive to drive.
+FEWEST = EACH * len(KINDS)
 
 
 class Drive(NamedTuple):

@@ -1,17 +1,15 @@
-"""Is there anything to learn? Scripted decisions beside the lawful car, on random roads that are full.
+"""Is there anything to learn? A script that yields, beside the lawful car alone, on full random roads.
 
     python -m benchmarks.yielding [--each N] [--kinds KIND ...] [--duration S] [--workers N] [--again]
                                   [--out docs/results]
 
-A factorial experiment: on each random validation road, two random combinations of the habits of `yield-rule`
-and their complements are driven, so that each habit is on in two drives of four. Beside them stand the car
-alone, the rule as it ships, and SUMO's drivers. Rows are kept in docs/results/data/yielding.csv.
+On each random validation road the same traffic meets the car alone, `yield-rule` with both of its habits and
+with one alone, SUMO's drivers, and no AVs. Rows are kept in docs/results/data/yielding.csv.
 """
 
 from __future__ import annotations
 
 import argparse
-import math
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -19,34 +17,27 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from benchmarks.drives import Case, measure
 from benchmarks.full_roads import EACH, KINDS, LARGEST, FullRoad, full_roads
 from benchmarks.tables import markdown_head, markdown_row, write_page
-from cosim.report.statistics import NA, Array, Figure, mean, paired_change
-from cosim.seeding import generator
+from cosim.report.statistics import Figure, paired_change
 
 RESULTS = Path("docs/results")
 PAGE, DATA = "yielding.md", "data/yielding.csv"
 RULE = "policy.agents.yield_rule"
-HABITS = {  # what an AV does, and the constant that turns it on
+HABITS = {  # what the rule does, and the constant that turns it on
     "eases off for signals": "EASES_OFF",
     "yields at lines": "YIELDS_AT_LINES",
-    "makes way": "MAKES_WAY",
-    "arrives gently": "ARRIVES_GENTLY",
-    "overtakes": "OVERTAKES",
 }
 CAR, SHIPPED = "the car alone", "`yield-rule`"
 DRIVERS: dict[str, dict[str, object]] = {
     CAR: {"policy": "car-alone"},
     SHIPPED: {"policy": "yield-rule"},
+    **{f"{habit} only": {"policy": "yield-rule"} for habit in HABITS},
     "`idm`": {"policy": "idm"},
     "`idm-courteous`": {"policy": "idm-courteous"},
     "no AVs": {"policy": "idm", "penetration": 0.0},
 }
-LETTERS = "abcde"  # of the habits
-ALL = "all"
 # Roads for an answer: the delay of one road changes by a third from drive to drive.
 FEWEST = EACH * len(KINDS)
 
@@ -54,7 +45,7 @@ FEWEST = EACH * len(KINDS)
 class Drive(NamedTuple):
     """A row of the CSV."""
 
-    driver: str  # of `DRIVERS`, or the letters of the habits that are on
+    driver: str  # of `DRIVERS`
     kind: str  # of road
     seed: int  # of the road and of its traffic
     total_delay_s: float
@@ -63,90 +54,49 @@ class Drive(NamedTuple):
     hard_brakings_av: float
 
 
-def combinations(seed: int) -> Iterator[str]:
-    """The letters (a to e) of the habits that are on: two different combinations and their complements."""
-    half = 2 ** (len(LETTERS) - 1)
-    for number in generator(seed, "yielding").choice(half, 2, replace=False).tolist():
-        for bits in (number, 2 * half - 1 - number):
-            yield "".join(letter for k, letter in enumerate(LETTERS) if bits >> k & 1) or "-"
-
-
 def case(driver: str, road: FullRoad, duration: float | None) -> Case:
     """One episode; `duration`: s, None: to its end."""
     options: dict[str, Any] = {"penetration": 0.2, "behavior": "moderate", "errors": "field", "svo_deg": 45.0}
-    options |= {"policy": "yield-rule", "what": str(road.folder), "seed": road.seed, "duration": duration}
-    options |= DRIVERS.get(driver, {})
-    on = {} if driver in DRIVERS else dict(zip(LETTERS, HABITS.values(), strict=True))
-    constants = {f"{RULE}.{name}": letter in driver for letter, name in on.items()}
-    return Case((driver, road.kind, road.seed), options, constants)
-
-
-def effects(rows: Sequence[Drive]) -> dict[str, Figure]:
-    """The relative change of everybody's delay by each habit, {letter: change}.
-
-    Least squares on logarithms, with an effect of each road. Intervals are of the jackknife over roads.
-    """
-    of: dict[int, list[Drive]] = {}
-    for row in rows:
-        if row.driver not in DRIVERS:
-            of.setdefault(row.seed, []).append(row)
-    on = [
-        np.array([[letter in row.driver for letter in LETTERS] for row in road], float)
-        for road in of.values()
-    ]
-    logs = [np.log([row.total_delay_s for row in road]) for road in of.values()]
-    x, y = ([values - values.mean(axis=0) for values in parts] for parts in (on, logs))
-
-    def fit(roads: Sequence[int]) -> Array:
-        found = [np.concatenate([parts[k] for k in roads]) for parts in (x, y)]
-        return np.linalg.lstsq(*found, rcond=None)[0]
-
-    every = [*range(len(of))]
-    if len(every) < 2:
-        return dict.fromkeys(LETTERS, NA)
-    part = len(every) * fit(every) - (len(every) - 1) * np.array(
-        [fit([*every[:k], *every[k + 1 :]]) for k in every]
+    options |= {"what": str(road.folder), "seed": road.seed, "duration": duration, **DRIVERS[driver]}
+    alone = driver.removesuffix(" only")
+    constants = (
+        {f"{RULE}.{name}": habit == alone for habit, name in HABITS.items()} if alone in HABITS else {}
     )
-    figures = [mean(column) for column in part.T]
-    return {
-        letter: Figure(*(math.expm1(x) for x in (one.value, one.low, one.high)))
-        for letter, one in zip(LETTERS, figures, strict=True)
-    }
+    return Case((driver, road.kind, road.seed), options, constants)
 
 
 # ---- the page ----
 
 
 def page(rows: Sequence[Drive]) -> list[str]:
-    """Effects by kind of road, then the drivers."""
+    """The answer, the drivers over all roads, then the rule by kind of road."""
     roads = Counter(kind for kind, _ in {(row.kind, row.seed) for row in rows})
-    groups = {ALL: list(rows)}
-    groups |= {k: [row for row in rows if row.kind == k] for k in sorted(roads) if roads[k] >= EACH}
-    found = {group: [*effects(of).values()] for group, of in groups.items()}
-    table = markdown_head(["", *groups])
-    table += [
-        markdown_row([habit, *(_percent(found[group][k]) for group in groups)])
-        for k, habit in enumerate(HABITS)
-    ]
-    of_roads = sum(roads.values())
-    saves = [habit for habit, one in zip(HABITS, found[ALL], strict=True) if one.high < 0.0]
-    costs = [habit for habit, one in zip(HABITS, found[ALL], strict=True) if one.low > 0.0]
-    said = [
-        f"{' and '.join(names)} {verb} delay" for names, verb in ((saves, "saves"), (costs, "costs")) if names
-    ]
-    answer = f"**Over all roads** {'; '.join(said) or 'no habit has an effect that is beyond chance'}."
-    if of_roads < FEWEST:
-        answer = f"**Not decided:** {of_roads} roads are too few."
+    change = _beside_car([row for row in rows if row.driver == SHIPPED], rows, "total_delay_s")
+    answer = f"`yield-rule` changes everybody's delay by {_percent(change)}"
+    if sum(roads.values()) < FEWEST:
+        answer = f"**Not decided:** {sum(roads.values())} roads are too few. {answer}"
+    elif change.high < 0.0:
+        answer = f"**Yes.** {answer}"
+    else:
+        answer = f"**No gain is shown.** {answer}"
     return WORDS.format(
-        answer=answer,
-        effects="\n".join(table),
+        answer=f"{answer}, against the car alone.",
         drivers="\n".join(_drivers(rows)),
+        kinds_table="\n".join(_kinds(rows, sorted(roads))),
         largest=LARGEST,
         roads=", ".join(f"{count} {kind}" for kind, count in sorted(roads.items())),
         each=max(roads.values(), default=EACH),
         kinds=" ".join(sorted(roads)),
         data=DATA,
     ).splitlines()
+
+
+def _beside_car(of: Sequence[Drive], rows: Sequence[Drive], column: str) -> Figure:
+    """The relative change of a mean against the car alone on the same roads."""
+    car = {row.seed: row for row in rows if row.driver == CAR}
+    pairs = [(car[row.seed], row) for row in of if row.seed in car]
+    before, after = ([getattr(pair[k], column) for pair in pairs] for k in (0, 1))
+    return paired_change(before, after)
 
 
 def _percent(figure: Figure) -> str:
@@ -157,45 +107,48 @@ def _drivers(rows: Sequence[Drive]) -> Iterator[str]:
     """Each driver beside the car on the same roads."""
     head = ["", "roads", "delay, s", "change", "of humans' delay", "AVs' hard brakings", "AVs' collisions"]
     yield from markdown_head(head)
-    car = {row.seed: row for row in rows if row.driver == CAR}
     for driver in DRIVERS:
-        of = [row for row in rows if row.driver == driver and row.seed in car]
+        of = [row for row in rows if row.driver == driver]
         if not of:
             continue
-        beside = [car[row.seed] for row in of]
-        change = ["", ""]
-        if driver != CAR:
-            columns = ("total_delay_s", "total_delay_hv_s")
-            change = [
-                _percent(paired_change([getattr(a, c) for a in beside], [getattr(b, c) for b in of]))
-                for c in columns
-            ]
+        columns = () if driver == CAR else ("total_delay_s", "total_delay_hv_s")
+        change = [_percent(_beside_car(of, rows, column)) for column in columns] or ["", ""]
         hard = "" if driver == "no AVs" else f"{fmean(row.hard_brakings_av for row in of):.0f}"
         hits = "" if driver == "no AVs" else f"{sum(row.av_involved_collisions for row in of):.0f}"
         delay = f"{fmean(row.total_delay_s for row in of):.1f}"
         yield markdown_row([driver, str(len(of)), delay, *change, hard, hits])
 
 
+def _kinds(rows: Sequence[Drive], kinds: Sequence[str]) -> Iterator[str]:
+    """The change by the rule on each kind of road."""
+    yield from markdown_head(["", "roads", CAR, SHIPPED, "change"])
+    for kind in kinds:
+        car, rule = ([r for r in rows if (r.driver, r.kind) == (d, kind)] for d in (CAR, SHIPPED))
+        delays = [f"{fmean(r.total_delay_s for r in of):.1f} s" if of else "" for of in (car, rule)]
+        change = _percent(_beside_car(rule, rows, "total_delay_s"))
+        yield markdown_row([f"`{kind}`", str(len(rule)), *delays, change])
+
+
 WORDS = """# Is there anything to learn beyond the lawful car?
 
-An agent can yield more than the car does by itself, or change lanes, which the car does for its
-route alone. Each habit below is a few lines of [`yield-rule`](../reference/presets.md#policies),
-with constants set by hand. No vehicle is marked. On each road the same traffic meets AVs with and
-without the habit, in random combinations with the others.
+The car alone is courteous where vehicles must change lanes. An agent can yield more:
+[`yield-rule`](../reference/presets.md#policies) eases off behind a vehicle that signals onto its
+lane. It also crawls, far before a line where another vehicle has waited, until that one is gone. No
+vehicle is marked.
 
 {answer}
 
-## Change of everybody's delay by each habit
-
-{effects}
-
-Least squares on logarithms with an effect of each road; brackets hold 95 % intervals over roads.
-
-## Drivers on the same roads
+## Everybody's mean delay
 
 {drivers}
 
-Changes are relative to the car alone.
+Changes are relative to the car alone; brackets hold 95 % intervals over roads. Three more habits
+were tried and lost: making way to another lane, arriving no faster than the traffic ahead, and
+overtaking.
+
+## By kind of road
+
+{kinds_table}
 
 ## Conditions
 
@@ -224,7 +177,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     args = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as folder:
         roads = [*full_roads(args.each, Path(folder), args.kinds)]
-        drivers = [(road, driver) for road in roads for driver in (*DRIVERS, *combinations(road.seed))]
+        drivers = [(road, driver) for road in roads for driver in DRIVERS]
         cases = [case(driver, road, args.duration) for road, driver in drivers]
         rows = measure(Drive, cases, args.workers, args.out / DATA, args.again)
     write_page(args.out / PAGE, page(rows))

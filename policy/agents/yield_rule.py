@@ -6,19 +6,13 @@ It is the baseline of the learned altruist: whatever learning is worth must show
 import math
 from collections.abc import Mapping
 
-import numpy as np
-
-from cosim.types import HEADING, SPEED, Decision, History, MetaAction, ObservationConfig, PolicyContext, X, Y
+from cosim.types import Decision, History, MetaAction, ObservationConfig, PolicyContext
 from policy.agents.idm import Idm
-from policy.inputs.conflict import LEFT, RIGHT, along, is_free
 from policy.inputs.needs import Need, Needs
 
 # What the AV does; docs/results/yielding.md measures the effect of each
 EASES_OFF = True  # behind a vehicle that signals onto its lane
 YIELDS_AT_LINES = True  # to a vehicle that has long waited at a line where it gives way to the AV
-MAKES_WAY = False  # changes lanes away from a vehicle that signals onto its lane
-ARRIVES_GENTLY = False  # is not much faster than the traffic ahead
-OVERTAKES = False  # changes to a faster lane: egoists too
 
 # Set by hand
 GAPS = 2.0, 40.0  # m to the other's rear, at least and at most: an AV nearer would stand beside it
@@ -28,11 +22,6 @@ PATIENCE = 5.0  # s that a vehicle has waited at its line
 HOLD_AT_LINE = 60.0  # s of yielding at a line at most
 UPSTREAM = 80.0  # m before its line, where the AV begins at the latest: nearer, it would close the gap itself
 CRAWL = 2.0  # m/s, of the AV while it lets a vehicle go
-SURPLUS = 4.0  # m/s above the mean speed of the traffic ahead
-STRETCH, SIDE, LEAST_AHEAD = (20.0, 120.0), 8.0, 3  # m ahead and aside, and vehicles, of this mean
-SAME_WAY = 0.5  # rad, the largest difference of their headings to the AV's
-GAIN, NEAR = 3.0, 80.0  # m/s that the other lane is faster, and m ahead that count
-SETTLE = 10.0  # s between two lane changes
 
 
 class YieldRule(Idm):
@@ -49,7 +38,6 @@ class YieldRule(Idm):
         self._began: dict[tuple[str, str], float] = {}  # (AV, vehicle) -> s, the begin of yielding
         self._rests: dict[str, float] = {}  # AV -> s, until then it does not begin to yield
         self._guides: dict[tuple[str, int], str] = {}  # (waiting vehicle, link) -> the AV that lets it go
-        self._changes: dict[str, float] = {}  # AV -> s, until then it does not change lanes
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
         """Accelerate, or the acceleration towards the lowest speed that any need asks for."""
@@ -63,14 +51,10 @@ class YieldRule(Idm):
 
     def _decision(self, history: History, needs: list[Need]) -> Decision:
         speeds = [self._speed(history, need) for need in needs if self._yields(history, need)]
-        if ARRIVES_GENTLY and self._weight > 0.0:
-            speeds.append(_mean_ahead(history) + SURPLUS)
         wanted = min(speeds, default=math.inf)
-        accel = wanted - history.ego_speed if wanted <= history.ego_speed + EASE else None
-        change = self._change(history, needs)
-        if change is None:
-            change = MetaAction.ACCELERATE if accel is None else MetaAction.IDLE
-        return Decision(change, accel=accel)
+        if wanted > history.ego_speed + EASE:
+            return Decision(MetaAction.ACCELERATE)
+        return Decision(MetaAction.IDLE, accel=wanted - history.ego_speed)
 
     def _chosen(
         self, histories: Mapping[str, History], needs: Mapping[str, list[Need]]
@@ -106,38 +90,3 @@ class YieldRule(Idm):
     def _speed(self, history: History, need: Need) -> float:
         """The speed (m/s) that a need asks for."""
         return CRAWL if need.crossing else max(need.speed - EASE * self._weight, 0.0)
-
-    def _change(self, history: History, needs: list[Need]) -> MetaAction | None:
-        """A lane change that makes way, or gains speed; None without one."""
-        av, now = history.ids[0], history.time
-        if now < self._changes.get(av, 0.0):
-            return None
-        for side, action in ((LEFT, MetaAction.LANE_LEFT), (RIGHT, MetaAction.LANE_RIGHT)):
-            leaves = MAKES_WAY and any(_is_left_for(side, need) for need in needs)
-            gains = OVERTAKES and _speed_ahead(history, side) > _speed_ahead(history, 1) + GAIN
-            if (leaves or gains) and is_free(history, side):
-                self._changes[av] = now + SETTLE
-                return action
-        return None
-
-
-def _is_left_for(side: int, need: Need) -> bool:
-    """Whether the vehicle is just ahead and signals from the other side than this one (`LEFT`, `RIGHT`)."""
-    return not need.crossing and need.from_right == (side == LEFT) and 0.0 <= need.gap <= GAPS[1]
-
-
-def _speed_ahead(history: History, side: int) -> float:
-    """The lowest speed (m/s) of the vehicles just ahead on a lane, at most the limit; 0 without a lane."""
-    path = history.route.paths[side]
-    if path is None:
-        return 0.0
-    speeds = [speed for ahead, speed in along(history, path) if 0.0 < ahead < NEAR]
-    return float(min([*speeds, history.route.speed_limit]))
-
-
-def _mean_ahead(history: History) -> float:
-    """The mean speed (m/s) of the vehicles ahead on all lanes of this direction; inf of too few."""
-    newest = history.kinematics[-1]
-    ahead = history.valid[-1] & (newest[:, X] > STRETCH[0]) & (newest[:, X] < STRETCH[1])
-    ahead &= (np.abs(newest[:, Y]) < SIDE) & (np.abs(newest[:, HEADING]) < SAME_WAY)
-    return float(newest[ahead, SPEED].mean()) if ahead.sum() >= LEAST_AHEAD else math.inf

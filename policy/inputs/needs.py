@@ -29,7 +29,6 @@ class Need(NamedTuple):
     speed: float  # m/s, of the vehicle
     remaining: float  # m, left to the vehicle before its line, or the end of its lane (inf: it does not end)
     waited: float  # s (`Waiting`)
-    from_right: bool = False  # it signals from the right of the AV's lane
     link: int = -1  # (crossing) the AV's way over the line: `RoadMap.links`
 
 
@@ -97,7 +96,7 @@ class Needs:
         meet = beside(self._road, own, theirs)
         if meet is None or (history.indicator[row] > 0) != meet[2] or theirs.lanes[0] in own.lanes:
             return None
-        mine, other, right = meet
+        mine, other, _ = meet
         newest = history.kinematics[-1, row]
         place = float(history.lane_position[row]) * theirs.scale  # m, front bumper
         half = 0.5 * float(history.kinematics[-1, 0, LENGTH])  # m, of the AV
@@ -105,7 +104,7 @@ class Needs:
         ahead = along(history, own)[:, 0]
         between = int(((ahead > 0.0) & (ahead < gap + half)).sum())
         left = theirs.length - place if theirs.dead_end else np.inf
-        return Need(history.ids[row], False, gap, between, float(newest[SPEED]), left, waited, right)
+        return Need(history.ids[row], False, gap, between, float(newest[SPEED]), left, waited)
 
     def _crossing(self, history: History, row: int, waited: float, line: float, link: int) -> Need | None:
         """The need of a vehicle that gives way to the AV, whose own line is `line` m ahead."""

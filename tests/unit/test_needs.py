@@ -11,7 +11,6 @@ from policy_scenes import LANE_WIDTH, Car, histories, straight_road
 
 from cosim.road import Lane, Link, RoadMap, Rule
 from cosim.types import COMPACT, History, MetaAction, PolicyContext, Timing
-from policy.agents import yield_rule
 from policy.agents.yield_rule import CRAWL, EASE, HOLD, PATIENCE, UPSTREAM, YieldRule
 from policy.inputs.needs import Need, Needs
 
@@ -40,7 +39,7 @@ OTHER = Car("other", 320.0, 0, 15.0)  # on the lane to the right of the AV
 
 def test_a_vehicle_that_signals_onto_the_avs_lane_needs_it() -> None:
     (need,) = needs(straight_road(), AV, OTHER, other=1)
-    assert need == Need("other", False, pytest.approx(15.0), 0, 15.0, np.inf, 0.0, from_right=True)
+    assert need == Need("other", False, pytest.approx(15.0), 0, 15.0, np.inf, 0.0)
     (need,) = needs(ENDS, AV, OTHER, other=1)
     assert need.remaining == pytest.approx(77.5)  # its front is at 322.5, its lane ends at 400
 
@@ -110,31 +109,6 @@ def test_the_rule_eases_off_behind_it_until_it_has_had_its_time() -> None:
     later = {"av": scene["av"]._replace(time=HOLD + 0.1)}
     assert rule.decide(later)["av"].action == MetaAction.ACCELERATE
     assert rule.decide(later)["av"].accel is None
-
-
-def changing(monkeypatch: pytest.MonkeyPatch, habit: str, cars: list[Car], **indicators: int) -> MetaAction:
-    """The AV's action on a road of three lanes with this habit alone."""
-    for constant in ("EASES_OFF", "YIELDS_AT_LINES", "MAKES_WAY", "ARRIVES_GENTLY", "OVERTAKES"):
-        monkeypatch.setattr(yield_rule, constant, constant == habit)
-    rule = YieldRule()
-    rule.reset(context(straight_road()))
-    return rule.decide(signalling(histories(straight_road(), cars), **indicators))["av"].action
-
-
-def test_the_rule_makes_way_for_it_where_the_other_lane_is_free(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert changing(monkeypatch, "MAKES_WAY", [AV, OTHER], other=1) == MetaAction.LANE_LEFT
-    beside = Car("beside", 302.0, 2, 20.0)
-    assert changing(monkeypatch, "MAKES_WAY", [AV, OTHER, beside], other=1) == MetaAction.ACCELERATE
-    assert changing(monkeypatch, "MAKES_WAY", [AV, OTHER]) == MetaAction.ACCELERATE
-
-
-def test_the_rule_overtakes_on_the_faster_lane(monkeypatch: pytest.MonkeyPatch) -> None:
-    slow = [AV, Car("slow", 340.0, 1, 10.0)]
-    assert changing(monkeypatch, "OVERTAKES", slow) == MetaAction.LANE_LEFT
-    slow_left = Car("left", 345.0, 2, 10.0)
-    assert changing(monkeypatch, "OVERTAKES", [*slow, slow_left]) == MetaAction.LANE_RIGHT
-    slow_right = Car("right", 345.0, 0, 11.0)
-    assert changing(monkeypatch, "OVERTAKES", [*slow, slow_left, slow_right]) == MetaAction.ACCELERATE
 
 
 def test_an_egoist_yields_to_nobody() -> None:

@@ -1,4 +1,4 @@
-"""The search over scripted yielding: its constants exist, rules are paired with the car road by road."""
+"""The search over scripted yielding: its constants exist, the rule is paired with the car road by road."""
 
 from __future__ import annotations
 
@@ -8,43 +8,42 @@ from pathlib import Path
 import pytest
 
 from benchmarks import yielding
-from benchmarks.full_roads import FULL, LARGEST, full_roads
+from benchmarks.full_roads import FULL, LARGEST, FullRoad, full_roads
 from cosim.seeding import TUNING_SEEDS
 from sumo_scenarios.draw import draw
 
 
-def test_each_habit_is_a_constant_of_the_rule() -> None:
+def test_each_habit_is_a_constant_of_the_rule_and_is_driven_alone() -> None:
     rule = importlib.import_module(yielding.RULE)
     assert all(isinstance(getattr(rule, constant), bool) for constant in yielding.HABITS.values())
-    assert len(yielding.LETTERS) == len(yielding.HABITS)
+    road = FullRoad(100_000, "weave", Path("weave"))
+    alone = yielding.case("yields at lines only", road, None)
+    assert alone.options["policy"] == "yield-rule"
+    assert alone.constants == {f"{yielding.RULE}.EASES_OFF": False, f"{yielding.RULE}.YIELDS_AT_LINES": True}
+    assert yielding.case("`yield-rule`", road, None).constants == {}
 
 
-@pytest.mark.parametrize("seed", range(100_000, 100_020))
-def test_each_habit_is_on_in_two_of_four_different_combinations(seed: int) -> None:
-    found = [*yielding.combinations(seed)]
-    assert len(set(found)) == 4
-    assert all(sum(letter in one for one in found) == 2 for letter in yielding.LETTERS)
-
-
-def row(driver: str, seed: int, delay: float) -> yielding.Drive:
-    return yielding.Drive(driver, "weave", seed, delay, delay, 0, 10)
-
-
-def test_the_effect_of_a_habit_is_that_of_drives_with_and_without_it_on_the_same_road() -> None:
-    rows = [
-        row(driver, seed, (10.0 + seed) * (0.8 if "b" in driver else 1.0) * (1.1 if "d" in driver else 1.0))
-        for seed in range(100_000, 100_030)
-        for driver in yielding.combinations(seed)
+def rows(driver: str, delay: float, roads: int) -> list[yielding.Drive]:
+    return [
+        yielding.Drive(driver, "weave", seed, delay * seed, delay * seed, 0, 10)
+        for seed in range(100_000, 100_000 + roads)
     ]
-    rows += [row(yielding.CAR, seed, 1.0) for seed in range(100_000, 100_030)]
-    found = yielding.effects(rows)
-    assert {letter: one.value for letter, one in found.items()} == pytest.approx(
-        {"a": 0.0, "b": -0.2, "c": 0.0, "d": 0.1, "e": 0.0}, abs=1e-6
+
+
+@pytest.mark.parametrize(
+    ("delay", "roads", "answer"),
+    [
+        (0.8, yielding.FEWEST, "**Yes.** `yield-rule` changes everybody's delay by -20"),
+        (1.1, yielding.FEWEST, "**No gain is shown.** `yield-rule` changes everybody's delay by 10"),
+        (0.8, 3, "**Not decided:** 3 roads are too few."),
+    ],
+)
+def test_the_rule_is_compared_with_the_car_on_the_same_roads(delay: float, roads: int, answer: str) -> None:
+    text = "\n".join(
+        yielding.page([*rows(yielding.CAR, 1e-3, roads), *rows("`yield-rule`", delay / 1e3, roads)])
     )
-    text = "\n".join(yielding.page([*rows, row("`idm`", 100_000, 1.5)]))
-    assert "| `idm` | 1 | 1.5 | 50 % | 50 % | 10 | 0 |" in text
-    assert "yields at lines saves delay" in text
-    assert "**Not decided:** 2 roads are too few." in "\n".join(yielding.page(rows[:8]))
+    assert answer in text
+    assert f"| `weave` | {roads} | 100.0 s | {100 * delay:.1f} s | {100 * delay - 100:.0f}" in text
 
 
 def test_the_roads_are_full_and_small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

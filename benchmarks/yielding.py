@@ -143,8 +143,8 @@ vehicle is marked.
 {drivers}
 
 Changes are relative to the car alone; brackets hold 95 % intervals over roads. Three more habits
-were tried and lost: making way to another lane, arriving no faster than the traffic ahead, and
-overtaking.
+were tried, and none is shown to save delay: making way to another lane, arriving no faster than the
+traffic ahead, and overtaking.
 
 ## By kind of road
 

@@ -37,7 +37,7 @@ def add(commands: arguments.SubCommands) -> None:
     )
     compare.add_argument("a", metavar="A", help="run folder, or DIR:POLICY")
     compare.add_argument("b", metavar="B", nargs="?", help="the same; default: A's folder")
-    names = "behavior, penetration, preset, errors, svo_deg, driver_model"
+    names = "behavior, penetration, preset, errors, sensing, svo_deg, driver_model"
     repeatable = {
         "--fail-on": ("THRESHOLD", "see below; repeatable"),
         "--across": ("FIELD", f"A and B may differ in this: {names}; repeatable"),

@@ -14,7 +14,7 @@ from research import figure8, schema
 RESULTS = Path(__file__).parents[2] / measured.RESULTS
 
 CLAIMS = schema.names()  # one that is not driven yet has no data
-OWN_COMMANDS = ("driver_errors.md", "forced_entry.md")  # docs/guides/reproduction.md
+OWN_COMMANDS = ("driver_errors.md",)  # docs/guides/reproduction.md
 
 
 def test_every_page_figure_and_picture_of_the_results_is_made_by_make_results() -> None:

@@ -149,7 +149,7 @@ def estimate(place: Place) -> list[list[str]]:
 
 def law(place: Place) -> list[list[str]]:
     """Compliance of AVs with traffic rules in the networks of tests/worlds."""
-    flags = ["--seeds", "20", "--runs", str(place.work / "law_runs")]
+    flags = ["--seeds", "10", "--runs", str(place.work / "law_runs")]
     if place.small:
         flags = ["--worlds", "arterial", "--arms", "random", "--penetration", "0.2", "--seeds", "1"]
     return [["benchmarks.law", "--page", *flags, "--out", str(place.out / "law.md")]]

@@ -35,6 +35,7 @@ DRIVERS: dict[str, dict[str, Any]] = {
     "`idm`": {"policy": "idm", "penetration": SHARE},
     "`idm-courteous`": {"policy": "idm-courteous", "penetration": SHARE},
     CAR: {"policy": "car-alone", "penetration": SHARE, "svo_deg": 45.0},
+    "`yield-rule`": {"policy": "yield-rule", "penetration": SHARE, "svo_deg": 45.0},
 }
 
 

@@ -69,6 +69,13 @@ def drive(
     return result
 
 
+@pytest.mark.parametrize("seed", [100_001, 100_004])
+def test_who_can_stop_comfortably_stops_for_yellow(law_worlds: dict[str, Path], seed: int) -> None:
+    """SUMO's driver alone drives on at about 79 s: it adds its headway to its braking distance."""
+    result = drive(law_worlds["arterial"], Always(MetaAction.ACCELERATE), seed=seed, duration=82.0)
+    assert result.value("red_light_violations") == 0
+
+
 @pytest.mark.parametrize("world", ["grid_signals", "all_way_stop", "crossing_unsignalled", "lane_drop"])
 def test_whoever_always_accelerates_breaks_no_law_in_lawful(law_worlds: dict[str, Path], world: str) -> None:
     result = drive(law_worlds[world], Always(MetaAction.ACCELERATE))

@@ -1,4 +1,4 @@
-"""The car of preset `lawful`: the agent's wish, limited by SUMO's own driver and by five more rules.
+"""The car of preset `lawful`: the agent's wish, limited by SUMO's own driver and by six more rules.
 
 Before every simulation step each rule limits the acceleration of the AV and names a reason. The AV drives the
 smallest limit, and an intervention is reported with its reason:
@@ -8,6 +8,7 @@ smallest limit, and an intervention is reported with its reason:
   the smallest, SUMO's driver drives by itself and may brake as hard as necessary;
 - `leader`: car following, and early braking for vehicles beyond the leader;
 - `follower`: room for a human follower that does not brake;
+- `signal`: signals that have turned yellow;
 - `crossing`: stop lines at which the AV gives way;
 - `way`: vehicles that block the AV's way inside a junction.
 """
@@ -24,6 +25,7 @@ from cosim.simulation.lawful.driver import Driver
 from cosim.simulation.lawful.follower import Follower
 from cosim.simulation.lawful.inside import Inside
 from cosim.simulation.lawful.leader import Leader
+from cosim.simulation.lawful.signal import Signal
 from cosim.simulation.lawful.waves import Waves
 from cosim.simulation.lawful.way import Way
 from cosim.simulation.lawful.wish import Wish
@@ -55,7 +57,8 @@ class Lawful(Commander):
         # The follower rule comes first: an evasion changes the limits of the other rules.
         before_leader = self._follower, self._wish, self._driver
         leader = Leader(self._eyes, self._waves, step)
-        self._rules: tuple[Rule, ...] = *before_leader, leader, self._crossing, self._way
+        signal = Signal(road, step)
+        self._rules: tuple[Rule, ...] = *before_leader, leader, signal, self._crossing, self._way
         self._last_check = -math.inf  # s, the last check of the right of way
         self._interventions: list[Intervention] = []
 

@@ -14,7 +14,15 @@ from research.schema import Condition
 from tests.research.claims import SMALL, claim, written
 
 CLAIMS = [schema.read(schema.FOLDER / f"{name}.yaml") for name in schema.names()]
-OF_THE_CAR = ("forced_entry", "humans", "label_free", "saturated", "saturated_car", "saturated_junctions", "saturated_v2v")
+OF_THE_CAR = (
+    "forced_entry",
+    "humans",
+    "label_free",
+    "saturated",
+    "saturated_car",
+    "saturated_junctions",
+    "saturated_v2v",
+)
 EVERYBODY = ("total_delay_s", "total_delay_av_s", "total_delay_hv_s", "longest_wait_s")
 MEANS = ("dt_mean_m", "dt_av_m", "dt_hv_m", "dt_mission_m", "hard_brakings_av", *EVERYBODY)
 

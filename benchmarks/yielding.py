@@ -29,11 +29,12 @@ HABITS = {  # what the rule does, and the constant that turns it on
     "eases off for signals": "EASES_OFF",
     "yields at lines": "YIELDS_AT_LINES",
 }
+ALONE = {f"{habit} only": constant for habit, constant in HABITS.items()}  # driver -> its only habit
 CAR, SHIPPED = "the car alone", "`yield-rule`"
 DRIVERS: dict[str, dict[str, object]] = {
     CAR: {"policy": "car-alone"},
     SHIPPED: {"policy": "yield-rule"},
-    **{f"{habit} only": {"policy": "yield-rule"} for habit in HABITS},
+    **{driver: {"policy": "yield-rule"} for driver in ALONE},
     "`idm`": {"policy": "idm"},
     "`idm-courteous`": {"policy": "idm-courteous"},
     "no AVs": {"policy": "idm", "penetration": 0.0},
@@ -58,10 +59,9 @@ def case(driver: str, road: FullRoad, duration: float | None) -> Case:
     """One episode; `duration`: s, None: to its end."""
     options: dict[str, Any] = {"penetration": 0.2, "behavior": "moderate", "errors": "field", "svo_deg": 45.0}
     options |= {"what": str(road.folder), "seed": road.seed, "duration": duration, **DRIVERS[driver]}
-    alone = driver.removesuffix(" only")
-    constants = (
-        {f"{RULE}.{name}": habit == alone for habit, name in HABITS.items()} if alone in HABITS else {}
-    )
+    constants: dict[str, object] = {}
+    if driver in ALONE:
+        constants = {f"{RULE}.{constant}": constant == ALONE[driver] for constant in HABITS.values()}
     return Case((driver, road.kind, road.seed), options, constants)
 
 

@@ -4,9 +4,9 @@ from functools import cache
 
 from cosim.metrics.context import AV, MetricContext
 from cosim.road import Crossing, Link, RoadMap, Rule
+from cosim.road.rules import COMFORT_DECEL
 from cosim.types import Entry, Metric, Offence, Snapshot
 
-COMFORT_DECEL = 3.0  # m/s2: yellow must be obeyed if this deceleration suffices
 STOPPED_SPEED = 0.5  # m/s, maximum within the last 10 m before a stop sign
 HARD_DECEL = 3.0 + 1e-3  # m/s2, above the comfortable 3.0: forbidden to cause for vehicles with priority
 LEADER = (

@@ -16,6 +16,7 @@ from cosim.arrays import Bytes, Floats
 from cosim.road import PATH_HORIZON, Crossing, LanePath, Link, RoadMap, Rule
 
 RED, YELLOW, GREEN = "ru", "yY", "gG"  # a signal's states (SUMO, Simulation/Traffic_Lights)
+COMFORT_DECEL = 3.0  # m/s2: yellow must be obeyed if this deceleration suffices (figures.md, The law)
 STOP_STATES = "s"  # the green arrow: stop, then yield
 YIELD_STATES = "gos"  # green without priority, off and blinking, the green arrow
 STOP_SIGNS = (Rule.STOP, Rule.ALL_WAY_STOP)

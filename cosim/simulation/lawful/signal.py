@@ -4,11 +4,10 @@ SUMO's driver adds its headway to its braking distance, and drives on where a co
 """
 
 from cosim.road import RoadMap
-from cosim.road.rules import RED, YELLOW
+from cosim.road.rules import COMFORT_DECEL, RED, YELLOW
 from cosim.simulation.backend import sumo
 from cosim.simulation.lawful.car import NO_LIMIT, Car, Limit, Rule
 
-COMFORT_DECEL = 3.0  # m/s2: yellow must be obeyed if this suffices (figures.md, The law)
 STOP_MARGIN = 0.5  # m before the line
 
 

@@ -32,6 +32,7 @@ from cosim.workers.progress import Progress
 from research import kept
 from research.schema import Claim, Condition
 
+PART = "part"  # of a pooled arm's row: the number of its condition
 MIN_EPISODES = 2  # episodes, however small the scale
 
 
@@ -77,6 +78,14 @@ class Arm:
 
 
 Arms = Mapping[tuple[Condition, str], Arm]  # of one claim
+
+
+def pooled(claim: Claim, arms: Arms) -> Arms:
+    """One arm for all conditions that the claim counts together; its rows say by `PART` of which they are."""
+    parts: dict[tuple[Condition, str], list[Arm]] = {}
+    for (condition, name), arm in arms.items():
+        parts.setdefault((claim.pooled(condition), name), []).append(arm)
+    return {key: _together(one) if len(one) > 1 else one[0] for key, one in parts.items()}
 
 
 @dataclass(frozen=True)
@@ -218,6 +227,11 @@ def _arm(plain: matrix.Cell, seeds: range) -> Arm:
     cell = replace(plain, case=case, manifest=about)
     weights = [digest for name, digest in files.items() if name.endswith(WEIGHTS)] or [*files.values(), ""]
     return Arm(cell, seeds, weights[0][:12], defined, label)
+
+
+def _together(arms: Sequence[Arm]) -> Arm:
+    rows = tuple({**row, PART: k} for k, arm in enumerate(arms) for row in arm.rows)
+    return replace(arms[0], rows=rows, definitions=_short([arm.definitions for arm in arms]))
 
 
 def _short(document: Any) -> str:

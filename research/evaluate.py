@@ -15,9 +15,9 @@ import numpy as np
 from cosim.errors import BadInput, hint
 from cosim.report.compare import PairedFigure, paired
 from cosim.report.figures import Measure, Row, measures
-from cosim.report.statistics import NA, Figure, holm, mean, power, share, signed_rank
+from cosim.report.statistics import NA, Figure, holm, mean, power, share, signed_rank, widened
 from cosim.workers.tasks import OK
-from research.drive import Arm, Arms, policy
+from research.drive import PART, Arm, Arms, policy, pooled
 from research.schema import Claim, Condition
 
 SIGNIFICANT = 0.05  # level for p, which is corrected for all tests of the claim
@@ -135,10 +135,11 @@ class Found:
 
 
 def evaluate(claim: Claim, arms: Arms, notes: Mapping[str, Mapping[str, str]]) -> Found:
-    """Test the claim on these episodes.
+    """Test the claim on these episodes, of every arm in each of the claim's conditions.
 
     Raises BadInput: a metric that the episodes do not have, or a test that does not fit the primary metric.
     """
+    arms = pooled(claim, arms)
     rows = [row for arm in arms.values() for row in arm.rows]
     known = measures(rows, notes.get("units"), notes.get("better"))
     for metric in claim.metrics:
@@ -163,7 +164,7 @@ def evaluate(claim: Claim, arms: Arms, notes: Mapping[str, Mapping[str, str]]) -
         Tested(
             *(condition, against, one, p, corrected),
             power(claim.power.smallest, one.difference, len(found)),
-            _verdict(claim, one.difference, corrected),
+            _verdict(claim, one.difference, corrected, len(found)),
         )
         for (condition, against, _), one, p, corrected in zip(compared, found, each, together, strict=True)
     ]
@@ -171,9 +172,9 @@ def evaluate(claim: Claim, arms: Arms, notes: Mapping[str, Mapping[str, str]]) -
 
 
 def pairs(before: Arm, after: Arm) -> list[tuple[Row, Row]]:
-    """The episodes of both arms on equal seeds, if both completed."""
-    first = {row["seed"]: row for row in _ok(before.rows)}
-    return [(first[row["seed"]], row) for row in _ok(after.rows) if row["seed"] in first]
+    """The episodes of both arms in equal traffic, if both completed."""
+    first = {_traffic(row): row for row in _ok(before.rows)}
+    return [(first[_traffic(row)], row) for row in _ok(after.rows) if _traffic(row) in first]
 
 
 def figure(measure: Measure, rows: Sequence[Row]) -> Figure:
@@ -212,6 +213,10 @@ def _ok(rows: Sequence[Row]) -> list[Row]:
     return [row for row in rows if row["status"] == OK]
 
 
+def _traffic(row: Row) -> tuple[int, int]:
+    return row.get(PART, 0), row["seed"]
+
+
 def _known(measure: Measure, rows: Sequence[Row]) -> list[float]:
     return [value for value in measure.values(_ok(rows)) if not math.isnan(value)]
 
@@ -223,12 +228,16 @@ def _p(claim: Claim, measure: Measure, found: PairedFigure, both: Sequence[tuple
     return signed_rank(before, after)
 
 
-def _verdict(claim: Claim, difference: Figure, p: float) -> Verdict:
-    """Yes: a significant difference in the claimed direction. No: the interval excludes `power.smallest`."""
+def _verdict(claim: Claim, difference: Figure, p: float, tests: int) -> Verdict:
+    """Yes: a significant difference in the claimed direction. No: `power.smallest` is excluded.
+
+    The interval that excludes it is wider than 95 %: by Bonferroni's correction for `tests` comparisons.
+    """
     if not difference.known:
         return "not resolved"
     sign = claim.primary.sign
     if p < SIGNIFICANT and sign * difference.value > 0.0:
         return "yes"
     largest = max(sign * difference.low, sign * difference.high)
+    largest += (widened(tests) - 1.0) * (largest - sign * difference.value)
     return "no" if largest < claim.power.smallest else "not resolved"

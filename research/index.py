@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from cosim.files import whole
-from research.drive import Arms, Work
+from research.drive import Arms, Work, pooled
 from research.schema import Claim
 
 NOT_DRIVEN = "Not driven yet."
@@ -55,7 +55,7 @@ def stale(claim: Claim, work: Work, out: Path) -> Iterator[str]:
 
     Pages not written by this engine are skipped.
     """
-    page, arms = out / f"{claim.name}.md", work.arms[claim.name]
+    page, arms = out / f"{claim.name}.md", pooled(claim, work.arms[claim.name])
     if answer(claim, out) != NOT_DRIVEN:
         if f"({claim.digest})" not in page.read_text(encoding="utf-8"):
             yield f"{page}: made from another definition of the claim"

@@ -94,6 +94,9 @@ def conditions(found: Found, settings: Settings) -> str:
     first = min(arm.seeds.start for arm in found.arms.values())
     failed = sum(row["status"] != OK for arm in found.arms.values() for row in arm.rows)
     parts = [f"All arms drive equal seeds from {first} on."]
+    for option in found.claim.pool:
+        values = " and ".join(str(value) for value in found.claim.matrix[option])
+        parts.append(f"Episodes of {option} {values} count together.")
     if found.claim.published:
         parts.append("Brackets and crosses are the paper's figures.")
     if settings.duration is not None:
@@ -113,7 +116,8 @@ def tests(found: Found) -> str:
         f"Intervals are 95 %. p is from {TESTS[claim.test]}, corrected by Holm's method "
         f"(tests: {len(found.tested)}). "
         f"A condition says yes if p is below 0.05 and the figure is {claim.primary.direction}, as claimed. "
-        f"It says no if the interval excludes an effect of {smallest} or more in the claimed direction. "
+        f"It says no if the interval, widened by Bonferroni's correction for all tests, excludes an effect "
+        f"of {smallest} or more in the claimed direction. "
         f"The claim must hold {claim.holds}."
     )
 

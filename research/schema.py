@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
@@ -98,6 +99,7 @@ class Claim:
     holds: Literal["everywhere", "somewhere"] = "everywhere"  # comparisons in which the claim must hold
     options: Mapping[str, Any] = field(default_factory=dict)  # of all arms
     matrix: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)  # option -> its values
+    pool: tuple[str, ...] = ()  # options of the matrix whose values count together, as one condition
     floors: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # additional arms without a test
     secondary: tuple[str, ...] = ()  # metrics
     published: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # scenario -> arm -> value
@@ -112,6 +114,8 @@ class Claim:
         for scenario, values in self.published.items():
             for arm in values:
                 one_of(arm, self.every_arm, f"published.{scenario}")
+        for option in self.pool:
+            one_of(option, self.matrix, "pool")
         if len(self.front) == 1:
             raise BadInput("two metrics or more are needed", field="front", value=self.front[0])
         self._check_seeds()
@@ -127,6 +131,10 @@ class Claim:
         """Scenario by scenario within each combination of the matrix."""
         axes = [[(name, value) for value in values] for name, values in self.matrix.items()]
         return [Condition(s, values) for values in itertools.product(*axes) for s in self.scenarios]
+
+    def pooled(self, condition: Condition) -> Condition:
+        """The condition without the options that count together."""
+        return condition._replace(values=tuple(v for v in condition.values if v[0] not in self.pool))
 
     @property
     def metrics(self) -> tuple[str, ...]:
@@ -158,9 +166,10 @@ class Claim:
         if self.seeds.first < FIRST_SEED:
             problem = f"the seeds of a claim start at {FIRST_SEED} or above"
             raise BadInput(problem, field="seeds.first", value=self.seeds.first)
-        fewest = min([self.seeds.count, *self.seeds.more.values()])
+        together = math.prod(len(self.matrix[option]) for option in self.pool)
+        fewest = together * min([self.seeds.count, *self.seeds.more.values()])
         if not 0 < self.power.pairs <= fewest:
-            problem = f"must be between 1 and {fewest}, the number of seeds"
+            problem = f"must be between 1 and {fewest}, the number of episodes in a condition"
             raise BadInput(problem, field="power.pairs", value=self.power.pairs)
 
     def _case(self, condition: Condition, arm: str) -> EpisodeOptions:

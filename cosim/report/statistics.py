@@ -204,8 +204,16 @@ def power(effect: float, difference: Figure, tests: int = 1) -> float:
     (the first step of `holm`). nan without an interval.
     """
     error = (difference.high - difference.low) / (2.0 * Z)
-    needed = float(stats.norm.isf((1.0 - CONFIDENCE) / 2.0 / tests))
+    needed = widened(tests) * Z
     return 1.0 if error == 0.0 else float(stats.norm.cdf(abs(effect) / error - needed))
+
+
+def widened(tests: int) -> float:
+    """The factor on the half width of an interval, in which `tests` intervals hold together.
+
+    Bonferroni's correction; normal approximation.
+    """
+    return float(stats.norm.isf((1.0 - CONFIDENCE) / 2.0 / tests)) / Z
 
 
 def paired_mean(before: Sequence[float] | Array, after: Sequence[float] | Array, seed: int = 0) -> Figure:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 from cosim.errors import BadInput
 from cosim.report.statistics import mcnemar
 from research.evaluate import Found, evaluate
+from research.schema import Condition
 from tests.research.claims import arms, claim, rows
 
 NOTES = {"units": {"dt_mean_m": "m"}, "better": {"dt_mean_m": "higher"}}
@@ -58,6 +60,31 @@ def test_too_few_episodes_resolve_nothing_and_say_which_power_they_had(tmp_path:
 def test_an_effect_the_other_way_is_no(tmp_path: Path) -> None:
     other = (SAVES[1], SAVES[0])
     assert found(tmp_path, other, other).verdict == "no"
+
+
+def test_more_tests_need_a_narrower_interval_for_no(tmp_path: Path) -> None:
+    same = (rows([1], 45), rows([2], 45))
+    assert found(tmp_path, same, same).tested[0].verdict == "not resolved"
+    alone = {key: arm for key, arm in found(tmp_path, same, same).arms.items() if key[0].scenario == "merge"}
+    assert evaluate(claim(tmp_path), alone, NOTES).verdict == "no"
+
+
+def test_conditions_that_count_together_are_one_and_pairs_stay_in_their_traffic(tmp_path: Path) -> None:
+    together = claim(tmp_path, matrix={"demand": ["dense", "contested"]}, pool=["demand"], options={})
+    dense, contested = (Condition("merge", (("demand", name),)) for name in ("dense", "contested"))
+    crashes = {(dense, "rule"): [], (dense, "idm"): [0], (contested, "rule"): [1], (contested, "idm"): [2]}
+    made = arms({("merge", f"{k}"): rows(which, 40) for k, which in enumerate(crashes.values())})
+    given = {
+        key: replace(arm, definitions=key[0].text) for key, arm in zip(crashes, made.values(), strict=True)
+    }
+    (one,) = evaluate(together, given, NOTES).tested
+    assert (one.condition, one.found.n) == (Condition("merge"), 80)
+    assert one.p == mcnemar(2, 1)
+    joined = evaluate(together, given, NOTES).arms[Condition("merge"), "rule"].definitions
+    other = {key: replace(arm, definitions="others") for key, arm in given.items() if key[0] == contested}
+    assert (
+        evaluate(together, {**given, **other}, NOTES).arms[Condition("merge"), "rule"].definitions != joined
+    )
 
 
 def test_tests_are_corrected_together(tmp_path: Path) -> None:

@@ -27,6 +27,7 @@ from cosim.report.statistics import (
     rule_of_three,
     share,
     signed_rank,
+    widened,
 )
 
 Z = 1.959963984540054
@@ -95,6 +96,11 @@ def test_the_power_of_a_test_follows_from_the_width_of_the_interval() -> None:
     assert power(2.8, one, tests=20) == pytest.approx(0.41, abs=0.01)
     assert power(1.0, Figure(0.0, 0.0, 0.0)) == 1.0
     assert math.isnan(power(1.0, Figure(0.0, math.nan, math.nan)))
+
+
+def test_intervals_that_hold_together_are_wider() -> None:
+    assert widened(1) == pytest.approx(1.0)
+    assert widened(20) * Z == pytest.approx(3.023, abs=1e-3)  # 0.05 / 20, both sides
 
 
 def test_interval_of_paired_shares_is_symmetric_and_stays_within_one() -> None:

@@ -17,9 +17,8 @@ YIELDS_AT_LINES = True  # to a vehicle that has long waited at a line where it g
 # Set by hand
 GAPS = 2.0, 40.0  # m to the other's rear, at least and at most: an AV nearer would stand beside it
 EASE = 4.0  # m/s below its speed
-HOLD, REST = 8.0, 6.0  # s of yielding at most, and then without it
+HOLD, REST = 8.0, 6.0  # s of yielding in vain at most, and then without it
 PATIENCE = 5.0  # s that a vehicle has waited at its line
-HOLD_AT_LINE = 60.0  # s of yielding at a line at most
 UPSTREAM = 80.0  # m before its line, where the AV begins at the latest: nearer, it would close the gap itself
 CRAWL = 2.0  # m/s, of the AV while it lets a vehicle go
 
@@ -43,10 +42,8 @@ class YieldRule(Idm):
         """Accelerate, or the acceleration towards the lowest speed that any need asks for."""
         needs = self._needs.find(histories) if self._weight > 0.0 else {}
         now = max((history.time for history in histories.values()), default=0.0)
-        self._began = {
-            pair: began for pair, began in self._began.items() if now - began < HOLD_AT_LINE + REST
-        }
-        self._guides = self._chosen(histories, needs)
+        self._began = {pair: began for pair, began in self._began.items() if now - began < HOLD + REST}
+        self._guides = self._chosen(needs, now)
         return {av: self._decision(history, needs.get(av, [])) for av, history in histories.items()}
 
     def _decision(self, history: History, needs: list[Need]) -> Decision:
@@ -56,13 +53,11 @@ class YieldRule(Idm):
             return Decision(MetaAction.ACCELERATE)
         return Decision(MetaAction.IDLE, accel=wanted - history.ego_speed)
 
-    def _chosen(
-        self, histories: Mapping[str, History], needs: Mapping[str, list[Need]]
-    ) -> dict[tuple[str, int], str]:
+    def _chosen(self, needs: Mapping[str, list[Need]], now: float) -> dict[tuple[str, int], str]:
         """For each waiting vehicle and each way across it, the AV that lets it go: the nearest that can."""
         found: dict[tuple[str, int], tuple[bool, float, str]] = {}
-        for av, of in needs.items():
-            for need in of:
+        for av in (av for av in needs if now >= self._rests.get(av, 0.0)):
+            for need in needs[av]:
                 key = need.vehicle, need.link
                 held = self._guides.get(key) == av
                 begins = need.crossing and need.waited >= PATIENCE and need.gap >= UPSTREAM
@@ -71,7 +66,7 @@ class YieldRule(Idm):
         return {key: av for key, (_, _, av) in found.items()}
 
     def _yields(self, history: History, need: Need) -> bool:
-        """Whether the need is this AV's to serve, now, and not for too long."""
+        """Whether the need is this AV's to serve, now, and not in vain for too long."""
         av, now = history.ids[0], history.time
         if need.crossing:
             fits = YIELDS_AT_LINES and self._guides.get((need.vehicle, need.link)) == av
@@ -80,8 +75,10 @@ class YieldRule(Idm):
         began = self._began.get((av, need.vehicle))
         if not fits or (began is None and now < self._rests.get(av, 0.0)):
             return False
-        began = self._began.setdefault((av, need.vehicle), now)
-        if now - began > (HOLD_AT_LINE if need.crossing else HOLD):
+        if began is None or need.between:  # nobody can use a gap before those ahead of the AV have passed
+            began = now
+        self._began[av, need.vehicle] = began
+        if now - began > HOLD:
             self._rests[av] = now + REST
             del self._began[av, need.vehicle]
             return False

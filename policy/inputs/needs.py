@@ -25,7 +25,7 @@ class Need(NamedTuple):
     vehicle: str
     crossing: bool  # it waits at a line where it gives way to the AV; else it signals onto the AV's lane
     gap: float  # m from the AV's front to the vehicle's rear, or (crossing) to the AV's own line
-    between: int  # vehicles on the AV's lane inside this gap
+    between: int  # vehicles on the AV's way inside this gap
     speed: float  # m/s, of the vehicle
     remaining: float  # m, left to the vehicle before its line, or the end of its lane (inf: it does not end)
     waited: float  # s (`Waiting`)
@@ -83,7 +83,7 @@ class Needs:
             waited = waiting.update(history.ids[row], speed, history.time)
             need = None
             if lane in lines:
-                need = self._crossing(history, row, waited, *lines[lane])
+                need = self._crossing(history, own, row, waited, *lines[lane])
             elif len(history.indicator) and history.indicator[row]:
                 need = self._merging(history, own, row, waited)
             if need is not None:
@@ -101,18 +101,27 @@ class Needs:
         place = float(history.lane_position[row]) * theirs.scale  # m, front bumper
         half = 0.5 * float(history.kinematics[-1, 0, LENGTH])  # m, of the AV
         gap = (mine - history.route.arc - half) - (other - place) - float(newest[LENGTH])
-        ahead = along(history, own)[:, 0]
-        between = int(((ahead > 0.0) & (ahead < gap + half)).sum())
+        between = self._between(history, own, gap)
         left = theirs.length - place if theirs.dead_end else np.inf
         return Need(history.ids[row], False, gap, between, float(newest[SPEED]), left, waited)
 
-    def _crossing(self, history: History, row: int, waited: float, line: float, link: int) -> Need | None:
+    def _crossing(
+        self, history: History, own: LanePath, row: int, waited: float, line: float, link: int
+    ) -> Need | None:
         """The need of a vehicle that gives way to the AV, whose own line is `line` m ahead."""
         remaining = self._road.lanes[int(history.lane[row])].length - float(history.lane_position[row])
         if remaining > LINE_RANGE:
             return None
         speed = float(history.kinematics[-1, row, SPEED])
-        return Need(history.ids[row], True, line, 0, speed, remaining, waited, link=link)
+        between = self._between(history, own, line)
+        return Need(history.ids[row], True, line, between, speed, remaining, waited, link=link)
+
+    @staticmethod
+    def _between(history: History, own: LanePath, gap: float) -> int:
+        """Vehicles on the AV's way within `gap` m of its front."""
+        half = 0.5 * float(history.kinematics[-1, 0, LENGTH])  # m, of the AV
+        ahead = along(history, own)[:, 0]
+        return int(((ahead > 0.0) & (ahead < gap + half)).sum())
 
     def _lines_ahead(self, history: History, own: LanePath) -> dict[int, tuple[float, int]]:
         """Lanes whose vehicles give way to this AV -> m to the AV's line there, and its link over it."""

@@ -11,7 +11,7 @@ from policy_scenes import LANE_WIDTH, Car, histories, straight_road
 
 from cosim.road import Lane, Link, RoadMap, Rule
 from cosim.types import COMPACT, History, MetaAction, PolicyContext, Timing
-from policy.agents.yield_rule import CRAWL, EASE, HOLD, PATIENCE, UPSTREAM, YieldRule
+from policy.agents.yield_rule import CRAWL, EASE, HOLD, PATIENCE, REST, UPSTREAM, YieldRule
 from policy.inputs.needs import Need, Needs
 
 ENDS = straight_road(dead_end=0)  # the right lane ends at x = 400
@@ -74,9 +74,9 @@ def crossing_road(rule: Rule) -> RoadMap:
     return RoadMap(lanes, links=(street, Link(2, -1, 1, -1, rule, foes=(0,) if rule == Rule.YIELD else ())))
 
 
-def at_line(road: RoadMap, time: float) -> dict[str, History]:
-    """The AV, and a car that stands 2 m before its line."""
-    scene = histories(road, [Car("av", 200.0, 0, 15.0, is_av=True), Car("waits", 191.5, 0, 0.0)])
+def at_line(road: RoadMap, time: float, *ahead: Car) -> dict[str, History]:
+    """The AV, a car that stands 2 m before its line, and vehicles ahead of the AV."""
+    scene = histories(road, [Car("av", 200.0, 0, 15.0, is_av=True), Car("waits", 191.5, 0, 0.0), *ahead])
     lane = scene["av"].lane.copy()
     lane[1] = 2
     return {"av": scene["av"]._replace(lane=lane, time=time)}
@@ -136,9 +136,25 @@ def test_the_rule_crawls_far_before_the_line_for_one_that_has_waited_long_until_
     assert wish(0.0, 200.0) == drives
     assert wish(PATIENCE, 400.0 - UPSTREAM) == drives  # too near to let it go
     assert wish(PATIENCE, 200.0) == crawls
-    assert wish(PATIENCE + 10.0, 400.0 - 0.5 * UPSTREAM) == crawls  # it has begun
+    assert wish(PATIENCE + HOLD, 400.0 - 0.5 * UPSTREAM) == crawls  # it has begun
     alone = histories(road, [Car("av", 300.0, 0, 15.0, is_av=True)])["av"]
-    assert rule.decide({"av": alone._replace(time=PATIENCE + 11.0)})["av"].accel == drives
+    assert rule.decide({"av": alone._replace(time=PATIENCE + HOLD + 1.0)})["av"].accel == drives
+
+
+def test_the_rule_gives_up_after_its_way_to_the_line_has_been_clear_in_vain() -> None:
+    road = crossing_road(Rule.YIELD)
+    rule = YieldRule()
+    rule.reset(context(road))
+    ahead = Car("ahead", 300.0, 0, 5.0)
+    crawls = [
+        rule.decide(at_line(road, time, *others))["av"].accel is not None
+        for time, *others in (
+            *((0.0, ahead), (PATIENCE, ahead), (PATIENCE + HOLD + 1.0, ahead)),
+            *((PATIENCE + HOLD + 2.0,), (PATIENCE + 2.0 * HOLD + 1.0,), (PATIENCE + 2.0 * HOLD + 2.0,)),
+            *((PATIENCE + 2.0 * HOLD + 3.0,), (PATIENCE + 2.0 * HOLD + 3.0 + REST,)),
+        )
+    ]
+    assert crawls == [False, True, True, True, True, False, False, True]
 
 
 def test_one_av_of_a_lane_lets_a_waiting_vehicle_go() -> None:

@@ -119,6 +119,11 @@ def page(runs: Sequence[Training], command: str, drawn: str = "") -> list[str]:
     return lines
 
 
+def shown(name: str, value: float) -> str:
+    """A figure's value as in the tables, shares in %."""
+    return f"{100.0 * value:.1f}" if name in PERCENT else f"{value:.0f}"
+
+
 def write_csv(path: Path, runs: Iterable[Training]) -> None:
     """Write the points of every run: all of validation, every `WINDOW`-th mean of the training drives."""
     with path.open("w", newline="", encoding="utf-8") as file:
@@ -193,8 +198,7 @@ def _shared(runs: Sequence[Training]) -> dict[tuple[str, str], list[Course]]:
 
 
 def _text(name: str, *values: float) -> str:
-    scale, digits = (100.0, 1) if name in PERCENT else (1.0, 0)
-    mean, low, high = (f"{scale * v:.{digits}f}" for v in values)
+    mean, low, high = (shown(name, v) for v in values)
     return mean if low == high else f"{mean} ({low} to {high})"
 
 

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.learning_curves import Course, main, page, read, smoothed, together
+from benchmarks import learning
+from benchmarks.learning_curves import Course, Training, main, page, read, smoothed, together
 from cosim.errors import BadInput
 
 
@@ -88,3 +89,17 @@ def test_a_folder_without_a_training_is_refused_with_one_sentence(
     (tmp_path / "log.jsonl").write_text("not json\n")
     assert main([str(tmp_path)]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize(("crashes", "said"), [(0.1, "**Yes**"), (0.9, "**No**")])
+def test_the_mask_helps_if_it_saves_crashes_and_the_agent_does_more(crashes: float, said: str) -> None:
+    def trained(label: str, crashed: float, other: float) -> Training:
+        values = {key: crashed if key == learning.CRASHES else other for key in learning.FIGURES}
+        courses = {key: Course(np.arange(4.0), np.full(4, value)) for key, value in values.items()}
+        return Training(label, f"{label}-0", courses, 4, 0)
+
+    masked, bare = trained(learning.MASKED, crashes, 0.6), trained(learning.BARE, 0.8, 0.4)
+    lines = learning.mask([masked, bare])
+    assert said in "\n".join(lines)
+    assert f"| `{learning.MASKED}` | {100.0 * crashes:.1f} | 60.0 |" in lines[-2]
+    assert learning.mask([masked]) == []

@@ -48,9 +48,8 @@ ARMS = ("altruist", "altruist-rule")  # the learned altruist, and a scripted one
 FOLDER = "guide"  # in the folder of runs, with one small file per episode
 MAX_EPISODES = 100  # per arm and demand
 SAMPLES = (SLOWS, YIELDS, OVERTAKES)  # T's three samples, from left to right
+TITLE = "# Figure 8 of T: how an AV makes room"
 HEADING = f"""\
-# Figure 8 of T: how an AV makes room
-
 The guide AV is the AV nearest to the merging vehicle at the moment of the merge. Only AVs count that
 perceive the merging vehicle and drove in its target lane within the {LOOKBACK:g} s before. The guide
 AV made room if it slowed by {MIN_SLOWING:g} m/s or more in that time, or moved to the left. Every
@@ -89,20 +88,19 @@ def record(settings: Settings) -> Found:
 
 def write(found: Found, settings: Settings, out: Path) -> Path:
     """t_figure8.md, pictures of every sample, data/t_figure8.csv; returns the page."""
-    lines, rows = [HEADING], list[Line]()
-    for condition in dict.fromkeys(condition for condition, _ in found):
-        lines += _counted(condition, found, rows)
+    answers, samples, rows = list[str](), list[str](), list[Line]()
     for name in dict.fromkeys(name for _, name in found):
         mine = [(c, arm, row) for (c, other), (arm, seen) in found.items() if other == name for row in seen]
-        for kind in SAMPLES:
-            lines += [f"## {name}: {kind}", ""]
+        made = sum(row["guided"]["kind"] in SAMPLES for _, _, row in mine)
+        answers.append(f"An AV made room in {made} of {len(mine)} episodes of `{name}`.")
+        for number, kind in enumerate(SAMPLES, 1):
             first = next((one for one in mine if one[2]["guided"]["kind"] == kind), None)
-            lines += (
-                _sample(f"{name}-{SAMPLES.index(kind) + 1}", *first, out)
-                if first
-                else [f"None of {len(mine)}."]
-            )
-            lines += [""]
+            if first:
+                samples += [f"## {name}: {kind}", "", *_sample(f"{name}-{number}", *first, out), ""]
+    lines = [TITLE, "", *page.wrapped(" ".join(answers)), "", HEADING]
+    for condition in dict.fromkeys(condition for condition, _ in found):
+        lines += _counted(condition, found, rows)
+    lines += samples
     lines += [
         f"Made by `python -m research.figure8{page.flags(settings)}`; figures in `data/{NAME}.csv`.",
         "",
@@ -163,7 +161,7 @@ def _counted(condition: Condition, found: Found, lines: list[Line]) -> list[str]
             lines.append(
                 line._replace(policy=drive.policy(arm.cell), weights=arm.weights, definitions=arm.definitions)
             )
-        cells = [f"{counts[kind]} = {figure.text(0, 100.0)} %" for kind, figure in figures.items()]
+        cells = [f"{figure.text(0, 100.0)} %" for figure in figures.values()]
         rows.append([name, arm.weights or "-", *cells, str(len(episodes))])
     return [f"## {condition.text}", "", *(f"| {' | '.join(row)} |" for row in rows), ""]
 

@@ -105,12 +105,13 @@ def test_the_page_counts_the_kinds_and_shows_the_first_of_each(tmp_path: Path) -
     (key, arm), *_ = arms({("merge", "altruist"): rows([], 2)}).items()
     arm.cell.scenario = type("Scenario", (), {"behavior": "moderate"})  # type: ignore[misc, assignment]
     page = figure8.write({key: (arm, episodes)}, Settings(), tmp_path).read_text()
-    assert "1 = 50 (9 to 91) %" in page
+    assert "An AV made room in 1 of 2 episodes of `altruist`." in page
+    assert "| 50 (9 to 91) % |" in page
     assert (
         "## altruist: slows down in its lane\n\n, moderate HVs, seed 1, trace hash\n`abababababababab`;"
         in page
     )
-    assert "## altruist: yields to the left\n\nNone of 2." in page
+    assert "## altruist: yields to the left" not in page
     assert (tmp_path / "t_figure8-altruist-1.svg").stat().st_size > 1000
     assert "altruist,,slows down in its lane,share,0.5," in (tmp_path / "data" / "t_figure8.csv").read_text()
 

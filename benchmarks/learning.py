@@ -46,32 +46,37 @@ def write(out: Path, given: Mapping[str, Sequence[Path]]) -> None:
 
 def mask(runs: Sequence[Training]) -> list[str]:
     """The section on P's claim that the safety prioritizer accelerates learning; empty without both."""
-    means = {label: _means([run for run in runs if run.label == label]) for label in (MASKED, BARE)}
-    if not all(means.values()):
+    of = {label: [run for run in runs if run.label == label] for label in (MASKED, BARE)}
+    if not all(of.values()):
         return []
-    masked, bare = means[MASKED], means[BARE]
-    better = masked[CRASHES] < bare[CRASHES] and all(masked[k] > bare[k] for k in FIGURES if k != CRASHES)
-    count = min(sum(run.label == label for run in runs) for label in means)
-    seeds = "one training seed" if count == 1 else f"{count} training seeds"
+    ends = {label: {key: _ends(mine, key) for key in FIGURES} for label, mine in of.items()}
+    gains = [
+        [last - first for first, last in (ends[label][key] for label in (MASKED, BARE))]
+        for key in FIGURES
+        if key != CRASHES
+    ]
+    yes = all(masked > bare for masked, bare in gains)
+    seeds = min(map(len, of.values()))
     head = ["agent", *(f"{COURSES[name]} ({PARTS[part]})" for part, name in FIGURES)]
+    rows = [
+        [f"`{label}`", *(" to ".join(learning_curves.shown(key[1], v) for v in mine[key]) for key in FIGURES)]
+        for label, mine in ends.items()
+    ]
     return [
         *("", "## Does the safety prioritizer accelerate learning?", ""),
-        f"P (section III) says so. **{'Yes' if better else 'No'}**, with {seeds} each, so without interval.",
-        f"`{MASKED}` and `{BARE}` differ in the mask alone. Values are means over the whole training.",
+        f"P (section III) says so. **{'Yes' if yes else 'Not shown'}**: `{MASKED}` and `{BARE}` differ in",
+        f"the mask alone, with training seeds: {seeds} each. The mask counts from the first drive on, before",
+        "anything is learned, so what learning adds is the change from the first value to the last:",
         "",
         *markdown_head(head),
-        *(
-            markdown_row([f"`{label}`", *(learning_curves.shown(key[1], of[key]) for key in FIGURES)])
-            for label, of in means.items()
-        ),
+        *map(markdown_row, rows),
     ]
 
 
-def _means(runs: Sequence[Training]) -> dict[tuple[str, str], float]:
-    """The mean of each figure over the whole training, over all runs; empty without runs."""
-    if not runs:
-        return {}
-    return {key: fmean(fmean(run.courses[key].value) for run in runs) for key in FIGURES}
+def _ends(runs: Sequence[Training], key: tuple[str, str]) -> tuple[float, float]:
+    """The first and the last value of a figure, means over the runs."""
+    first, last = (fmean(float(run.courses[key].value[k]) for run in runs) for k in (0, -1))
+    return first, last
 
 
 def found(policy: str) -> list[Path]:

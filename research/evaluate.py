@@ -15,7 +15,7 @@ import numpy as np
 from cosim.errors import BadInput, hint
 from cosim.report.compare import PairedFigure, paired
 from cosim.report.figures import Measure, Row, measures
-from cosim.report.statistics import NA, Figure, holm, mean, power, share, signed_rank, widened
+from cosim.report.statistics import NA, Figure, holm, mean, paired_share, power, share, signed_rank, widened
 from cosim.workers.tasks import OK
 from research.drive import PART, Arm, Arms, policy, pooled
 from research.schema import Claim, Condition
@@ -164,9 +164,9 @@ def evaluate(claim: Claim, arms: Arms, notes: Mapping[str, Mapping[str, str]]) -
         Tested(
             *(condition, against, one, p, corrected),
             power(claim.power.smallest, one.difference, len(found)),
-            _verdict(claim, one.difference, corrected, len(found)),
+            _verdict(claim, one, _most(claim, one, both, len(found)), corrected),
         )
-        for (condition, against, _), one, p, corrected in zip(compared, found, each, together, strict=True)
+        for (condition, against, both), one, p, corrected in zip(compared, found, each, together, strict=True)
     ]
     return Found(claim, arms, known, tuple(tested))
 
@@ -228,16 +228,33 @@ def _p(claim: Claim, measure: Measure, found: PairedFigure, both: Sequence[tuple
     return signed_rank(before, after)
 
 
-def _verdict(claim: Claim, difference: Figure, p: float, tests: int) -> Verdict:
+def _most(claim: Claim, one: PairedFigure, both: Sequence[tuple[Row, Row]], tests: int) -> float:
+    """The largest effect in the claimed direction that is not excluded.
+
+    Its interval is wider than 95 %: by Bonferroni's correction for `tests` comparisons.
+    """
+    sign, wide = claim.primary.sign, one.difference
+    if one.measure.is_rate:
+        values = np.array([one.measure.values([pair[k] for pair in both]) for k in (0, 1)])
+        before, after = values[:, ~np.isnan(values).any(0)] > 0.0
+        wide = paired_share(before, after, tests)
+        return max(sign * wide.low, sign * wide.high)
+    most = max(sign * wide.low, sign * wide.high)
+    return most + (widened(tests) - 1.0) * (most - sign * wide.value)
+
+
+def _verdict(claim: Claim, one: PairedFigure, most: float, p: float) -> Verdict:
     """Yes: a significant difference in the claimed direction. No: `power.smallest` is excluded.
 
-    The interval that excludes it is wider than 95 %: by Bonferroni's correction for `tests` comparisons.
+    Where the other arm's share leaves no room for such an effect, only an effect the other way says no.
     """
+    difference, sign = one.difference, claim.primary.sign
     if not difference.known:
         return "not resolved"
-    sign = claim.primary.sign
     if p < SIGNIFICANT and sign * difference.value > 0.0:
         return "yes"
-    largest = max(sign * difference.low, sign * difference.high)
-    largest += (widened(tests) - 1.0) * (largest - sign * difference.value)
-    return "no" if largest < claim.power.smallest else "not resolved"
+    room = math.inf
+    if one.measure.is_rate:
+        room = 1.0 - one.a.value if sign > 0.0 else one.a.value
+    possible = claim.power.smallest <= room or most < 0.0
+    return "no" if most < claim.power.smallest and possible else "not resolved"

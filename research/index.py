@@ -21,8 +21,8 @@ P: Valiente et al., prediction-aware cooperative driving. T: Toghi et al., altru
 Both simulate with HighwayEnv, we with SUMO; scenarios and demands are ours. Every line is written by
 `python -m research page` from `research/claims/`. A claim without a verdict has not been driven yet.
 
-| claim | source | verdict | page |
-|---|---|---|---|
+| claim | source | must hold | verdict | page |
+|---|---|---|---|---|
 """
 
 
@@ -32,7 +32,7 @@ def write(claims: Sequence[Claim], out: Path) -> Path:
     for claim in claims:
         page = out / f"{claim.name}.md"
         there = f"[{claim.name}]({page.name})" if page.is_file() else ""
-        text += f"| {claim.sentence} | {claim.source} | {answer(claim, out)} | {there} |\n"
+        text += f"| {claim.sentence} | {claim.source} | {claim.holds} | {answer(claim, out)} | {there} |\n"
     others = sorted(p.name for p in out.glob("*.md") if p.name != "README.md")
     text += "\nAll pages: " + ", ".join(f"[{name.removesuffix('.md')}]({name})" for name in others) + ".\n"
     with whole(out / "README.md") as draft:

@@ -14,8 +14,9 @@ from cosim.report import wording
 from cosim.report.compare import PairedFigure
 from cosim.report.figures import Measure
 from cosim.workers.tasks import OK
+from policy.agents import APPROACHES
 from research import picture
-from research.drive import Settings
+from research.drive import Settings, policy
 from research.evaluate import Found, Line, traffic_of
 from research.schema import Condition
 
@@ -99,6 +100,8 @@ def conditions(found: Found, settings: Settings) -> str:
         parts.append(f"Episodes of {option} {values} count together.")
     if found.claim.published:
         parts.append("Brackets and crosses are the paper's figures.")
+    if any(policy(arm.cell) in APPROACHES for arm in found.arms.values()):
+        parts.append("A network is one training: intervals leave out what another training would change.")
     if settings.duration is not None:
         parts.append(f"**Episodes are cut to {settings.duration:g} s.**")
     if failed:
@@ -117,7 +120,7 @@ def tests(found: Found) -> str:
         f"(tests: {len(found.tested)}). "
         f"A condition says yes if p is below 0.05 and the figure is {claim.primary.direction}, as claimed. "
         f"It says no if the interval, widened by Bonferroni's correction for all tests, excludes an effect "
-        f"of {smallest} or more in the claimed direction. "
+        f"of {smallest} or more in the claimed direction, and the other arm leaves room for one. "
         f"The claim must hold {claim.holds}."
     )
 
@@ -127,8 +130,7 @@ def powered(found: Found) -> str:
     known = [t.power for t in found.tested if not math.isnan(t.power)]
     span = f"{_span(round(100 * x) for x in known)} %" if known else "unknown"
     pairs = _span(t.found.n for t in found.tested)
-    planned = f"{pairs} pairs a test, planned {found.claim.power.pairs}"
-    return f"Power to find the smallest effect of interest: {span} ({planned})."
+    return f"Power to find the smallest effect of interest: {span} ({pairs} pairs a test)."
 
 
 def flags(settings: Settings) -> str:
@@ -184,12 +186,19 @@ def _differences(found: Found, here: Sequence[Condition]) -> Iterator[list[str]]
     first = claim.compare.against[0]
     for metric in claim.secondary:
         pairs = [found.difference(condition, first, metric) for condition in here]
-        name = f"{_column_head(found.measures[metric], 'pp')}, difference to {first}"
-        yield [name, _span(p.n for p in pairs), *about, *(_difference(p, False) for p in pairs)]
+        name = f"{_column_head(found.measures[metric], '%')} of {claim.compare.arm}; difference to {first}"
+        yield [name, _span(p.n for p in pairs), *about, *map(_level, pairs)]
 
 
 def _difference(one: PairedFigure, unit: bool = True) -> str:
     return wording.interval(one.difference, one.measure, signed=True, unit=unit)
+
+
+def _level(one: PairedFigure) -> str:
+    """`3.0; +1.0 (+0.2 to +1.8)`: the claim's arm, and its difference."""
+    if not one.b.known:
+        return "NA"
+    return f"{wording.number(one.b.value, one.measure, unit=False)}; {_difference(one, False)}"
 
 
 def _column_head(measure: Measure, share: str) -> str:

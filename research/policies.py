@@ -39,6 +39,20 @@ class MaskOnly(PredictionAware):
         return q
 
 
+class RandomChoice(MaskOnly):
+    """All actions are valued at random at every decision."""
+
+    def values(self, inputs: Inputs) -> Floats32:
+        """[agents, actions] uniform random numbers."""
+        size = len(inputs.scene.agents), len(MetaAction)
+        return self._context.rng.random(size, np.float32)
+
+
 def cruise() -> MaskOnly:
     """Keeps lane and speed behind the mask of `vfn-p`."""
     return MaskOnly("cruise", compact("vfn-p"))
+
+
+def masked_random() -> RandomChoice:
+    """Chooses at random among the actions that the mask of `vfn-p` admits."""
+    return RandomChoice("masked-random", compact("vfn-p"))

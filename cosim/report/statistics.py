@@ -157,13 +157,14 @@ def quantile(values: Sequence[float] | Array, q: float) -> Figure:
 # ---- pairs on equal seeds: entry i of `before` and of `after` is the same traffic ----
 
 
-def paired_share(before: Bools, after: Bools) -> Figure:
+def paired_share(before: Bools, after: Bools, tests: int = 1) -> Figure:
     """Difference of two proportions, after - before, with Tango's score interval (1998).
 
-    This interval keeps its width if no pair differs, and its coverage at small counts.
+    This interval keeps its width if no pair differs, and its coverage at small counts. It is wider for
+    `tests` intervals that hold together (`widened`).
     """
     lost, gained = discordant(before, after)
-    return _tango(gained, lost, len(before))
+    return _tango(gained, lost, len(before), widened(tests) * Z)
 
 
 def discordant(before: Bools, after: Bools) -> tuple[int, int]:
@@ -342,7 +343,7 @@ def _bootstrap(samples: tuple[Array, ...], statistic: Callable[..., Any], seed: 
     return Figure(value, *map(float, bounds))
 
 
-def _tango(gained: int, lost: int, count: int) -> Figure:
+def _tango(gained: int, lost: int, count: int, z: float) -> Figure:
     """Score interval of (gained - lost) / count: the differences d that a score test does not reject.
 
     Tango, Statistics in Medicine 17 (1998) 891-908, equation (10) for the variance under d.
@@ -363,6 +364,6 @@ def _tango(gained: int, lost: int, count: int) -> Figure:
         return off / math.sqrt(variance) if variance > 0.0 else math.copysign(math.inf, off) if off else 0.0
 
     edge = 1.0 - 1e-9  # at -1 and 1 the variance is 0
-    low = -1.0 if value <= -edge else brentq(lambda d: score(d) - Z, -edge, value)
-    high = 1.0 if value >= edge else brentq(lambda d: score(d) + Z, value, edge)
+    low = -1.0 if value <= -edge else brentq(lambda d: score(d) - z, -edge, value)
+    high = 1.0 if value >= edge else brentq(lambda d: score(d) + z, value, edge)
     return Figure(value, float(low), float(high))

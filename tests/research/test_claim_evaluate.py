@@ -28,7 +28,7 @@ def found(folder: Path, merge: Any, exit: Any, **changes: Any) -> Found:
 
 
 SAVES = (rows([], 400), rows(range(100), 400))  # 25 points fewer
-EQUAL = (rows([1], 400), rows([2], 400))
+EQUAL = (rows(range(100), 400), rows(range(1, 101), 400))
 FEW = (rows([], 20), rows([1, 2, 3], 20))
 
 
@@ -63,10 +63,16 @@ def test_an_effect_the_other_way_is_no(tmp_path: Path) -> None:
 
 
 def test_more_tests_need_a_narrower_interval_for_no(tmp_path: Path) -> None:
-    same = (rows([1], 45), rows([2], 45))
+    same = (rows(range(10), 45), rows(range(1, 11), 45))
     assert found(tmp_path, same, same).tested[0].verdict == "not resolved"
     alone = {key: arm for key, arm in found(tmp_path, same, same).arms.items() if key[0].scenario == "merge"}
     assert evaluate(claim(tmp_path), alone, NOTES).verdict == "no"
+
+
+def test_a_share_without_room_for_the_effect_cannot_say_no_but_its_opposite_can(tmp_path: Path) -> None:
+    clean = (rows([], 400), rows([], 400))
+    assert {t.verdict for t in found(tmp_path, clean, clean).tested} == {"not resolved"}
+    assert {t.verdict for t in found(tmp_path, SAVES[::-1], SAVES[::-1]).tested} == {"no"}
 
 
 def test_conditions_that_count_together_are_one_and_pairs_stay_in_their_traffic(tmp_path: Path) -> None:

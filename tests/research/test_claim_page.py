@@ -47,7 +47,7 @@ def test_the_table_has_a_row_for_every_arm_and_difference(found: Found) -> None:
     assert rows[3].startswith("| idm | 400 | unguarded | stress | mixed | - | 25.0 (21.0 to 29.5)")
     assert rows[4].startswith("| lane | 40 |")
     assert rows[5].endswith("p < 0.001: yes |")
-    assert rows[6].startswith("| dt_mean_m, m, difference to idm | 400 |")
+    assert rows[6].startswith("| dt_mean_m, m of rule; difference to idm | 400 |")
 
 
 def test_it_says_conditions_tests_power_and_the_command(found: Found) -> None:
@@ -56,7 +56,7 @@ def test_it_says_conditions_tests_power_and_the_command(found: Found) -> None:
     assert "Brackets and crosses are the paper's figures." in text
     assert "**Episodes are cut to 2 s.**" in text
     assert "excludes an effect of 10 pp or more in the claimed direction" in text
-    assert "Power to find the smallest effect of interest: 99 % (400 pairs a test," in text
+    assert "Power to find the smallest effect of interest: 99 % (400 pairs a test)." in text
     assert "`python -m research page small --scale 0.5 --duration 2` from" in text
 
 
@@ -85,10 +85,10 @@ def test_the_index_has_a_line_for_every_claim_and_says_what_is_not_driven(
     page.write(found, Settings(), tmp_path)
     text = index.write([found.claim, other], tmp_path).read_text()
     assert (
-        f"| {SMALL['sentence']} | ours | **Yes.** By condition: 2 yes; "
+        f"| {SMALL['sentence']} | ours | everywhere | **Yes.** By condition: 2 yes; "
         "difference to `idm` -25.0 pp (-28.1 to -22.1), 800 pairs | [small](small.md) |" in text
     )
-    assert "| Nobody drove this | ours | Not driven yet. |  |" in text
+    assert "| Nobody drove this | ours | everywhere | Not driven yet. |  |" in text
     assert "All pages: [small](small.md)." in text
 
 

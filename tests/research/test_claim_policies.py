@@ -10,7 +10,7 @@ from policy_scenes import Car, histories, straight_road
 from cosim.policies import make
 from cosim.types import Decision, MetaAction, PolicyContext, Timing
 from policy.agents.approaches import compact
-from research.policies import MaskOnly, cruise
+from research.policies import MaskOnly, cruise, masked_random
 
 ROAD = straight_road(2)
 PLAIN = compact("vfn-p")
@@ -52,3 +52,19 @@ def test_without_intentions_a_follower_may_not_drive_as_close() -> None:
 def test_a_claim_names_it_and_its_rows_warn_of_nothing() -> None:
     made = make("cruise=research.policies:cruise")
     assert (made.name, made.label) == ("cruise", "")
+
+
+def test_random_decisions_are_drawn_anew_and_stay_behind_the_mask() -> None:
+    free = [Car("a", 300.0, 0, 20.0, is_av=True), Car("b", 500.0, 0, 20.0, is_av=True)]
+    agent = masked_random()
+    agent.reset(PolicyContext(ROAD, Timing(), agent.observation, 0.0, np.random.default_rng(0)))
+    scene = histories(ROAD, free, agent.observation)
+    chosen = [agent.decide(scene)[name].action for _ in range(40) for name in ("a", "b")]
+    assert len(set(chosen)) > 3
+    blocked = [
+        Car("a", 300.0, 0, 25.0, is_av=True),
+        Car("slow", 335.0, 0, 5.0),
+        Car("beside", 298.0, 1, 25.0),
+    ]
+    scene = histories(ROAD, blocked, agent.observation)
+    assert {agent.decide(scene)["a"].action for _ in range(40)} == {MetaAction.DECELERATE}

@@ -216,7 +216,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--bf16", action="store_true", help="networks in bfloat16")
     parser.add_argument("--episodes", type=int, default=4, help="whole episodes, to drive and to train")
     parser.add_argument(
-        "--config", nargs="+", default=["compact"], help="training configuration: name or file"
+        "--config", nargs="+", default=["papers"], help="training configuration: name or file"
     )
     parser.add_argument("--scenario", default="merge", help="training scenario")
     parser.add_argument("--demand", default="contested", help="training demand")

@@ -81,7 +81,8 @@ def agent(place: Place) -> list[list[str]]:
     flags = ["--size", *sizes, "--threads", "1", "2", "--decisions", "12", "--episodes", "4"]
     if place.small:
         flags = ["--size", *sizes, "--threads", "1", "--decisions", "1", "--only", "decision"]
-    return [["benchmarks.agent", *flags, "--config", *sizes, "--out", str(place.out / "agent.md")]]
+    configs = ["papers"] if place.small else ["papers", "paper"]
+    return [["benchmarks.agent", *flags, "--config", *configs, "--out", str(place.out / "agent.md")]]
 
 
 def decision_cost(place: Place) -> list[list[str]]:

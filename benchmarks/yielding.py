@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from statistics import fmean
+from textwrap import fill
 from typing import Any, NamedTuple
 
 from benchmarks.drives import Case, measure
@@ -40,6 +41,7 @@ DRIVERS: dict[str, dict[str, object]] = {
     "no AVs": {"policy": "idm", "penetration": 0.0},
 }
 # Roads for an answer: the delay of one road changes by a third from drive to drive.
+COLUMNS = 100  # of the page
 FEWEST = EACH * len(KINDS)
 
 
@@ -80,7 +82,7 @@ def page(rows: Sequence[Drive]) -> list[str]:
     else:
         answer = f"**No gain is shown.** {answer}"
     return WORDS.format(
-        answer=f"{answer}, against the car alone.",
+        answer=fill(f"{answer}, against the car alone.{_costs(rows, sorted(roads))}", COLUMNS),
         drivers="\n".join(_drivers(rows)),
         kinds_table="\n".join(_kinds(rows, sorted(roads))),
         largest=LARGEST,
@@ -89,6 +91,16 @@ def page(rows: Sequence[Drive]) -> list[str]:
         kinds=" ".join(sorted(roads)),
         data=DATA,
     ).splitlines()
+
+
+def _costs(rows: Sequence[Drive], kinds: Sequence[str]) -> str:
+    """A sentence on the kinds of road where the rule is shown to cost delay; empty without one."""
+    changes = {
+        kind: _beside_car([r for r in rows if (r.driver, r.kind) == (SHIPPED, kind)], rows, "total_delay_s")
+        for kind in kinds
+    }
+    costs = [f"{_percent(change)} on `{kind}` roads" for kind, change in changes.items() if change.low > 0.0]
+    return f" It costs {' and '.join(costs)}." if costs else ""
 
 
 def _beside_car(of: Sequence[Drive], rows: Sequence[Drive], column: str) -> Figure:
@@ -133,8 +145,8 @@ WORDS = """# Is there anything to learn beyond the lawful car?
 
 The car alone is courteous where vehicles must change lanes. An agent can yield more:
 [`yield-rule`](../reference/presets.md#policies) eases off behind a vehicle that signals onto its
-lane. It also crawls, far before a line where another vehicle has waited, until that one is gone. No
-vehicle is marked.
+lane. It also crawls, far before a line where another vehicle has waited, until that one is gone or has
+not used a clear way. No vehicle is marked.
 
 {answer}
 

@@ -43,6 +43,7 @@ def test_the_rule_is_compared_with_the_car_on_the_same_roads(delay: float, roads
         yielding.page([*rows(yielding.CAR, 1e-3, roads), *rows("`yield-rule`", delay / 1e3, roads)])
     )
     assert answer in text
+    assert ("It costs 10 (10 to 10) % on `weave` roads." in " ".join(text.split())) == (delay > 1.0)
     assert f"| `weave` | {roads} | 100.0 s | {100 * delay:.1f} s | {100 * delay - 100:.0f}" in text
 
 

@@ -7,6 +7,7 @@ machine-dependent columns. A row is reused only for exactly its cell.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Container, Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -23,6 +24,7 @@ from cosim.workers.tasks import OK
 
 FOLDER = Path("docs/results/episodes")
 ROWS, MANIFEST = "episodes.parquet", "manifest.json"
+DIGITS = 30  # binary digits of a kept float: 1e-9
 ZSTD_LEVEL = 19  # high, because files are rarely written
 MARK = "#"  # between a policy's name and the hash of its definitions
 MACHINE_COLUMNS = ("timings", "stderr", "attempts")  # not reproducible, like each column of `timings`
@@ -75,14 +77,25 @@ def write(rows: Sequence[Row], manifest: Mapping[str, Any], folder: Path) -> Non
     place = {name: k for k, name in enumerate(manifest["cells"])}
     table = arrow([plain(row) for row in sorted(rows, key=lambda r: (place[r["cell"]], r["seed"]))])
     with whole(folder / ROWS) as rows_draft, whole(folder / MANIFEST) as draft:
-        pyarrow.parquet.write_table(table, rows_draft, compression="zstd", compression_level=ZSTD_LEVEL)
-        draft.write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
+        floats = [field.name for field in table.schema if pyarrow.types.is_floating(field.type)]
+        pyarrow.parquet.write_table(
+            table,
+            rows_draft,
+            compression="zstd",
+            compression_level=ZSTD_LEVEL,
+            use_dictionary=[name for name in table.column_names if name not in floats],
+            use_byte_stream_split=floats,
+        )
+        draft.write_text(json.dumps(manifest, separators=(",", ":")) + "\n", encoding="utf-8")
 
 
 def plain(row: Row) -> dict[str, Any]:
-    """The row without machine-dependent columns, equal when the episode is driven again."""
-    timings = json.loads(row.get("timings") or "{}")
-    return {name: value for name, value in row.items() if name not in (*MACHINE_COLUMNS, *timings)}
+    """The row without machine-dependent columns, equal when the episode is driven again.
+
+    Floats are rounded to `DIGITS`, far below any interval, because the file is part of every checkout.
+    """
+    left_out = (*MACHINE_COLUMNS, *json.loads(row.get("timings") or "{}"))
+    return {name: _rounded(value) for name, value in row.items() if name not in left_out}
 
 
 def packages(versions: Mapping[str, str | None]) -> dict[str, str]:
@@ -93,6 +106,13 @@ def packages(versions: Mapping[str, str | None]) -> dict[str, str]:
 def unmarked(text: str) -> str:
     """The policy's name for `--policy`, without the mark and the hash."""
     return text.partition(MARK)[0]
+
+
+def _rounded(value: Any) -> Any:
+    if not isinstance(value, float) or not math.isfinite(value):
+        return value
+    fraction, exponent = math.frexp(value)
+    return math.ldexp(round(math.ldexp(fraction, DIGITS)), exponent - DIGITS)
 
 
 def _replayable(cell: Mapping[str, Any]) -> dict[str, Any]:

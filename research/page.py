@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import math
 import textwrap
 from collections.abc import Iterable, Iterator, Sequence
@@ -21,6 +22,7 @@ from research.evaluate import Found, Line, traffic_of
 from research.schema import Condition
 
 OUT = Path("docs/results")
+FEW = 2  # arms to compare with, so that the secondary figures are shown against each
 WIDTH = 100  # columns of prose
 TESTS = {"mcnemar": "McNemar's exact test", "signed_rank": "Wilcoxon's signed ranks"}
 WORDS = {"yes": "Yes.", "no": "No.", "not resolved": "Not resolved."}
@@ -176,17 +178,17 @@ def _figure_cell(found: Found, condition: Condition, name: str) -> str:
 
 
 def _differences(found: Found, here: Sequence[Condition]) -> Iterator[list[str]]:
-    """Rows of the primary figure against each arm, and of the secondary ones against the first."""
+    """Rows of the primary figure against each arm, and of the secondary ones (many arms: against the first)."""
     claim = found.claim
     _, *about = _arm_cells(found, here, claim.compare.arm)
     for against in claim.compare.against:
         tested = [t for c in here for t in found.tested if (t.condition, t.against) == (c, against)]
         texts = [f"{_difference(t.found, False)}, {wording.p_value(t.p_holm)}: {t.verdict}" for t in tested]
         yield [f"difference to {against}", _span(t.found.n for t in tested), *about, *texts]
-    first = claim.compare.against[0]
-    for metric in claim.secondary:
-        pairs = [found.difference(condition, first, metric) for condition in here]
-        name = f"{_column_head(found.measures[metric], '%')} of {claim.compare.arm}; difference to {first}"
+    others = claim.compare.against if len(claim.compare.against) <= FEW else claim.compare.against[:1]
+    for metric, against in itertools.product(claim.secondary, others):
+        pairs = [found.difference(condition, against, metric) for condition in here]
+        name = f"{_column_head(found.measures[metric], '%')} of {claim.compare.arm}; difference to {against}"
         yield [name, _span(p.n for p in pairs), *about, *map(_level, pairs)]
 
 

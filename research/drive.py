@@ -72,6 +72,11 @@ class Arm:
     rows: tuple[Row, ...] = ()  # by seed, of any status
 
     @property
+    def network(self) -> bool:
+        """Whether its policy has trained weights."""
+        return any(name.endswith(WEIGHTS) for name in self.cell.manifest[POLICY_FILES])
+
+    @property
     def complete(self) -> bool:
         """Whether every episode was driven."""
         return len(self.rows) == len(self.seeds)

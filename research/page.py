@@ -15,9 +15,8 @@ from cosim.report import wording
 from cosim.report.compare import PairedFigure
 from cosim.report.figures import Measure
 from cosim.workers.tasks import OK
-from policy.agents import APPROACHES
 from research import picture
-from research.drive import Settings, policy
+from research.drive import Settings
 from research.evaluate import Found, Line, traffic_of
 from research.schema import Condition
 
@@ -102,7 +101,7 @@ def conditions(found: Found, settings: Settings) -> str:
         parts.append(f"Episodes of {option} {values} count together.")
     if found.claim.published:
         parts.append("Brackets and crosses are the paper's figures.")
-    if any(policy(arm.cell) in APPROACHES for arm in found.arms.values()):
+    if any(arm.network for arm in found.arms.values()):
         parts.append("A network is one training: intervals leave out what another training would change.")
     if settings.duration is not None:
         parts.append(f"**Episodes are cut to {settings.duration:g} s.**")
@@ -178,7 +177,7 @@ def _figure_cell(found: Found, condition: Condition, name: str) -> str:
 
 
 def _differences(found: Found, here: Sequence[Condition]) -> Iterator[list[str]]:
-    """Rows of the primary figure against each arm, and of the secondary ones (many arms: against the first)."""
+    """Rows of the primary figure against each arm, and of the others (many arms: against the first)."""
     claim = found.claim
     _, *about = _arm_cells(found, here, claim.compare.arm)
     for against in claim.compare.against:

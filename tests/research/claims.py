@@ -55,7 +55,9 @@ def arms(of: Mapping[tuple[str, str], Sequence[Mapping[str, Any]]]) -> Arms:
     """(scenario, arm) -> rows as the engine holds them."""
     found = {}
     for (scenario, name), mine in of.items():
-        cell: Any = SimpleNamespace(case=SimpleNamespace(policy=f"{name}#mark"))
+        cell: Any = SimpleNamespace(
+            case=SimpleNamespace(policy=f"{name}#mark"), manifest={"policy_files": {}}
+        )
         weights = "" if name == "idm" else "0123456789ab"
         found[Condition(scenario), name] = Arm(
             cell, range(len(mine)), weights, "definitions", "", tuple(mine)

@@ -145,8 +145,8 @@ WORDS = """# Is there anything to learn beyond the lawful car?
 
 The car alone is courteous where vehicles must change lanes. An agent can yield more:
 [`yield-rule`](../reference/presets.md#policies) eases off behind a vehicle that signals onto its
-lane. It also crawls, far before a line where another vehicle has waited, until that one is gone or has
-not used a clear way. No vehicle is marked.
+lane. It also crawls, far before a line where another vehicle has waited, until that one is gone or
+has not used a clear way. No vehicle is marked.
 
 {answer}
 

@@ -22,6 +22,7 @@ OF_THE_CAR = (
     "saturated_car",
     "saturated_junctions",
     "saturated_v2v",
+    "yielding_safety",
 )
 EVERYBODY = ("total_delay_s", "total_delay_av_s", "total_delay_hv_s", "longest_wait_s")
 MEANS = ("dt_mean_m", "dt_av_m", "dt_hv_m", "dt_mission_m", "hard_brakings_av", *EVERYBODY)

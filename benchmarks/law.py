@@ -165,7 +165,7 @@ def _columns(cell: Cell, idm: Cell, free: bool) -> dict[str, tuple[str, bool | N
     episodes = len(cell.rows)
     worst = max(row["law"]["worst_speeding_mps"] for row in cell.rows)
     over = int(cell.total("speeding_steps"))
-    caused = int(cell.figure("av_caused_collisions") or 0)
+    hits, caused = (int(cell.figure(f"av_{name}_collisions") or 0) for name in ("involved", "caused"))
     trips, wanted = cell.total("av_trips_completed"), idm.total("av_trips_completed")
     distance, other = cell.total("distance_mean_m") / episodes, idm.total("distance_mean_m") / episodes
     hard, allowed = cell.total("hard_brakings_av"), idm.total("hard_brakings_av")
@@ -178,7 +178,7 @@ def _columns(cell: Cell, idm: Cell, free: bool) -> dict[str, tuple[str, bool | N
             cell.total("right_of_way_violations") <= idm.total("right_of_way_violations"),
         ),
         "steps too fast (worst)": (f"{over} ({worst:+.1f} m/s)", not over),
-        "AV collisions (caused)": (f"{int(cell.total('av_involved_collisions'))} ({caused})", not caused),
+        "AV collisions (caused)": (f"{hits} ({caused})", not caused),
         "stuck": (cell.rate("avs_stuck"), not cell.total("avs_stuck")),
         "AV trips": (f"{trips:.0f} of {wanted:.0f}", targeted and trips >= 0.95 * wanted),
         "distance of all": (f"{distance:.0f} of {other:.0f} m", targeted and distance >= 0.95 * other),
@@ -327,6 +327,7 @@ def page(rows: Sequence[Row], preset: str, seeds: range, command: str) -> list[s
         "red light, no stop sign, no step above the limit by more than 1 m/s, no collision caused by an AV,",
         "no AV stuck, and at most as many failures to yield as `idm`. Agents other than `random` also need",
         "95 % of `idm`'s trips and distance, and at most twice its hard brakings.",
+        "Collisions are cosim's figure, which has overlaps that SUMO does not report.",
         "",
         "```",
         command,

@@ -118,11 +118,8 @@ def tests(found: Found) -> str:
     )
     return (
         f"Intervals are 95 %. p is from {TESTS[claim.test]}, corrected by Holm's method "
-        f"(tests: {len(found.tested)}). "
-        f"A condition says yes if p is below 0.05 and the figure is {claim.primary.direction}, as claimed. "
-        f"It says no if the interval, widened by Bonferroni's correction for all tests, excludes an effect "
-        f"of {smallest} or more in the claimed direction, and the other arm leaves room for one. "
-        f"The claim must hold {claim.holds}."
+        f"(tests: {len(found.tested)}). The smallest effect of interest is {smallest}; the claim must hold "
+        f"{claim.holds} ([verdicts](../guides/reproduction.md#how-it-works))."
     )
 
 

@@ -55,7 +55,7 @@ def test_it_says_conditions_tests_power_and_the_command(found: Found) -> None:
     assert "A note." in text
     assert "Brackets and crosses are the paper's figures." in text
     assert "**Episodes are cut to 2 s.**" in text
-    assert "excludes an effect of 10 pp or more in the claimed direction" in text
+    assert "The smallest effect of interest is 10 pp; the claim must hold everywhere" in text
     assert "Power to find the smallest effect of interest: 99 % (400 pairs a test)." in text
     assert "`python -m research page small --scale 0.5 --duration 2` from" in text
 

@@ -40,8 +40,8 @@ DRIVERS: dict[str, dict[str, object]] = {
     "`idm-courteous`": {"policy": "idm-courteous"},
     "no AVs": {"policy": "idm", "penetration": 0.0},
 }
-# Roads for an answer: the delay of one road changes by a third from drive to drive.
 COLUMNS = 100  # of the page
+# Roads for an answer: the delay of one road changes by a third from drive to drive.
 FEWEST = EACH * len(KINDS)
 
 

@@ -16,6 +16,7 @@ from cosim.errors import BadInput, hint
 from cosim.report.compare import PairedFigure, paired
 from cosim.report.figures import Measure, Row, measures
 from cosim.report.statistics import NA, Figure, holm, mean, paired_share, power, share, signed_rank, widened
+from cosim.types import Floats
 from cosim.workers.tasks import OK
 from research.drive import PART, Arm, Arms, policy, pooled
 from research.schema import Claim, Condition
@@ -224,8 +225,12 @@ def _known(measure: Measure, rows: Sequence[Row]) -> list[float]:
 def _p(claim: Claim, measure: Measure, found: PairedFigure, both: Sequence[tuple[Row, Row]]) -> float:
     if claim.test == "mcnemar":
         return 1.0 if found.p is None else found.p
-    before, after = (np.array(measure.values([pair[k] for pair in both])) for k in (0, 1))
-    return signed_rank(before, after)
+    return signed_rank(*_sides(measure, both))
+
+
+def _sides(measure: Measure, both: Sequence[tuple[Row, Row]]) -> Floats:
+    """[2,pairs] the values before and after; nan: NA."""
+    return np.array([measure.values([pair[k] for pair in both]) for k in (0, 1)])
 
 
 def _most(claim: Claim, one: PairedFigure, both: Sequence[tuple[Row, Row]], tests: int) -> float:
@@ -235,7 +240,7 @@ def _most(claim: Claim, one: PairedFigure, both: Sequence[tuple[Row, Row]], test
     """
     sign, wide = claim.primary.sign, one.difference
     if one.measure.is_rate:
-        values = np.array([one.measure.values([pair[k] for pair in both]) for k in (0, 1)])
+        values = _sides(one.measure, both)
         before, after = values[:, ~np.isnan(values).any(0)] > 0.0
         wide = paired_share(before, after, tests)
         return max(sign * wide.low, sign * wide.high)

@@ -56,8 +56,10 @@ class YieldRule(Idm):
     def _chosen(self, needs: Mapping[str, list[Need]], now: float) -> dict[tuple[str, int], str]:
         """For each waiting vehicle and each way across it, the AV that lets it go: the nearest that can."""
         found: dict[tuple[str, int], tuple[bool, float, str]] = {}
-        for av in (av for av in needs if now >= self._rests.get(av, 0.0)):
-            for need in needs[av]:
+        for av, of in needs.items():
+            if now < self._rests.get(av, 0.0):
+                continue
+            for need in of:
                 key = need.vehicle, need.link
                 held = self._guides.get(key) == av
                 begins = need.crossing and need.waited >= PATIENCE and need.gap >= UPSTREAM

@@ -24,12 +24,12 @@ from matplotlib.figure import Figure as Picture
 
 from benchmarks.tables import markdown_row, write_page
 from cosim.errors import BadInput, CosimError
+from cosim.learning.picture import save
 from cosim.types import Floats
 
 COURSES = {"crashed": "crashed, %", "mission_success": "missions fulfilled, %", "dt_mean_m": "distance, m"}
 PERCENT = ("crashed", "mission_success")
 PARTS = {"train": "training drives", "valid": "validation, greedy"}
-DPI = 110
 WINDOW = 20  # iterations, averaging window of training drives
 
 
@@ -146,7 +146,7 @@ def draw(path: Path, runs: Sequence[Training]) -> None:
             _draw(axes[row, column], runs, (part, name))
             axes[row, column].set(title=f"{title} ({PARTS[part]})", xlabel="iterations")
     picture.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside right upper", fontsize="small")
-    picture.savefig(path, dpi=DPI)
+    save(picture, path)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

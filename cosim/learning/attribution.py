@@ -16,6 +16,7 @@ from cosim.batch.matrix import Plan
 from cosim.batch.record import planned
 from cosim.errors import BadInput, one_of
 from cosim.files import write_csv
+from cosim.learning.picture import save
 from cosim.learning.prediction_data import spread
 from cosim.policies import make
 from cosim.report.statistics import holm, mean, paired_mean, paired_share, share, signed_rank
@@ -314,4 +315,4 @@ def draw(path: Path, tables: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
         axis.set(title=policy, xlabel="choices changed, %")
     for axis in panels:  # those without a policy
         axis.remove()
-    figure.savefig(path, dpi=110)
+    save(figure, path)

@@ -11,6 +11,7 @@ import numpy as np
 from cosim.errors import BadInput
 from cosim.files import write_csv
 from cosim.learning import map_bench, map_figures
+from cosim.learning.picture import save
 from cosim.learning.prediction_scores import LEVEL, Predicted, Scores
 from cosim.recording.file import Recording, read
 from cosim.recording.folder import Folder, fits
@@ -253,7 +254,7 @@ def plot(file: Path, scores: Scores) -> None:
     for axis in list(axes.flat)[len(panels) :]:
         axis.axis("off")
     figure.tight_layout()
-    figure.savefig(file, dpi=110)
+    save(figure, file)
     plt.close(figure)
 
 

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from cosim.errors import BadInput
 from cosim.learning.map_bench import load_hpns
+from cosim.learning.picture import save
 from cosim.learning.prediction_data import Followed, followed
 from cosim.recording.file import read
 from cosim.recording.folder import Folder
@@ -22,7 +23,6 @@ from policy.prediction.predictors import make_predictor
 
 SHOWN_HORIZONS = (0.2, 1.0, 2.0, 3.0, 4.0)  # s, columns of a chain's picture
 STYLE = {"hpn": "-", "hpn-no-history": "--", "hpn-plain": ":", "last-frame": "-.", "gp-raster": "-"}
-DPI = 110
 
 
 def training(logs: Mapping[str, Path], out: Path) -> None:
@@ -42,7 +42,7 @@ def training(logs: Mapping[str, Path], out: Path) -> None:
     low, high = (f(a.get_ylim()[k] for a in pair) for k, f in ((0, min), (1, max)))
     for axis in pair:
         axis.set_ylim(low, high)
-    figure.savefig(out, dpi=DPI)
+    save(figure, out)
 
 
 def errors(table: Sequence[Mapping[str, Any]], out: Path) -> None:
@@ -63,7 +63,7 @@ def errors(table: Sequence[Mapping[str, Any]], out: Path) -> None:
     axes[0, 0].set_ylabel("PRE in 1e-3 per pixel")
     axes[1, 0].set_ylabel("IoU")
     axes[0, 0].legend(fontsize="small")
-    figure.savefig(out, dpi=DPI)
+    save(figure, out)
 
 
 def pictures(
@@ -123,7 +123,7 @@ def _chain(now: Followed, av: str, predictors: MapPredictors, world: str, out: P
         axis.set_title(f"{world}, {horizon:g} s ahead", fontsize="small")
     for row, (name, maps) in zip(axes, lines, strict=True):
         _show(row, name, [picture(one) for one in maps])
-    figure.savefig(out, dpi=DPI)
+    save(figure, out)
 
 
 def _grid(rows: int, columns: int) -> tuple[Figure, Any]:
@@ -154,4 +154,4 @@ def _features(now: Followed, av: str, hpns: Mapping[str, Any], road: RoadMap, wo
     for row, (name, maps) in zip(axes, rows, strict=True):
         _show(row, name, maps)
     figure.suptitle(f"{world}: inner features", fontsize="small")
-    figure.savefig(out, dpi=DPI)
+    save(figure, out)

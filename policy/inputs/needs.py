@@ -49,11 +49,23 @@ class Waiting:
             self._known.pop(vehicle, None)
         return waited
 
+    def tell(self) -> dict[str, tuple[float, float]]:
+        """A message to other AVs: vehicle -> s that it has waited, and when that was known (s)."""
+        return dict(self._known)
+
+    def hear(self, told: Mapping[str, tuple[float, float]], time: float) -> None:
+        """Take over longer counts from a message, as if each vehicle had driven since."""
+        for vehicle, (waited, known) in told.items():
+            waited -= FORGET * (time - known)
+            if waited > self._known.get(vehicle, (0.0, time))[0]:
+                self._known[vehicle] = waited, time
+
 
 class Needs:
     """The needs of each AV; remembers for how long vehicles have waited.
 
-    AVs that share their perception share this memory too.
+    AVs that share their perception share this memory too. Otherwise an AV tells it to those that hear its
+    intentions (`History.hears`).
     """
 
     def __init__(self, context: PolicyContext) -> None:
@@ -64,8 +76,12 @@ class Needs:
     def find(self, histories: Mapping[str, History]) -> dict[str, list[Need]]:
         """AV -> the needs that it can serve, nearest first; AVs without a need are left out."""
         found = {}
+        told = {av: waiting.tell() for av, waiting in self._waiting.items()}
         for av, history in histories.items():
-            needs = self._of(history, self._waiting.setdefault("" if self._pooled else av, Waiting()))
+            waiting = self._waiting.setdefault("" if self._pooled else av, Waiting())
+            for other in sorted(history.hears or ()):
+                waiting.hear(told.get(other, {}), history.time)
+            needs = self._of(history, waiting)
             if needs:
                 found[av] = sorted(needs, key=lambda need: need.gap)
         return found

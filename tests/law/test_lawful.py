@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import libsumo
@@ -17,6 +18,7 @@ from cosim.host import Host
 from cosim.road.rules import RulesAhead
 from cosim.scenario import load
 from cosim.scenario.human_errors import levels
+from cosim.scenario.sensing import read
 from cosim.scenario.vet import vetted
 from cosim.simulation.lawful import follower, inside, way
 from cosim.simulation.lawful.car import Car
@@ -126,6 +128,17 @@ def test_the_car_makes_room_for_who_closes_in_and_does_not_brake() -> None:
     seeds = (100_103, 100_117, 100_123)
     assert all(hit_from_behind(Unheeding, seeds))
     assert not any(hit_from_behind(Host, seeds))
+
+
+@pytest.mark.parametrize("sensing", ["ideal", "v2v"])
+def test_it_slows_down_before_a_human_who_brakes(start: Start, sensing: str) -> None:
+    """No evasion, though estimates of the human's braking are late and noisy."""
+    pair = [vehicle("av", "av", 160.0, speed=11.0), vehicle("human", "hv", 140.0, speed=11.0)]
+    worker = start(pair, preset=Preset.LAWFUL, sensing=read(sensing))
+    frames = [f for _ in range(15) for f in worker.call("advance", [Command("av", 2.0, 0, 0.4)])[1]]
+    speeds = [float(f.speed[f.row["av"]]) for f in frames]
+    assert speeds[-1] == pytest.approx(2.0, abs=0.2)
+    assert all(after < before + 0.1 for before, after in pairwise(speeds))
 
 
 class Unseeing(SumoSimulator):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import replace
 
@@ -12,7 +13,7 @@ from policy_scenes import LANE_WIDTH, Car, histories, straight_road
 from cosim.road import Lane, Link, RoadMap, Rule
 from cosim.types import COMPACT, History, MetaAction, PolicyContext, Timing
 from policy.agents.yield_rule import CRAWL, EASE, HOLD, PATIENCE, REST, UPSTREAM, YieldRule
-from policy.inputs.needs import Need, Needs
+from policy.inputs.needs import FORGET, Need, Needs
 
 ENDS = straight_road(dead_end=0)  # the right lane ends at x = 400
 AV = Car("av", 300.0, 1, 20.0, is_av=True)
@@ -90,6 +91,21 @@ def test_a_vehicle_that_gives_way_to_the_av_needs_it_the_more_the_longer_it_has_
     assert need == Need(
         "waits", True, pytest.approx(197.5), 0, 0.0, pytest.approx(2.0), pytest.approx(3.0), link=0
     )
+
+
+def test_who_hears_another_av_knows_for_how_long_a_vehicle_has_waited() -> None:
+    road = crossing_road(Rule.YIELD)
+    of = Needs(replace(context(road), share_perception=False))
+    for time in (0.0, 6.0):
+        of.find(at_line(road, time))
+
+    def waited(hears: frozenset[str] | None) -> float:
+        came = at_line(road, 6.5)["av"]
+        came = came._replace(ids=("came", *came.ids[1:]), hears=hears)
+        return Needs.find(copy.deepcopy(of), {"came": came})["came"][0].waited
+
+    assert waited(None) == waited(frozenset()) == 0.0
+    assert waited(frozenset({"av"})) == pytest.approx(6.0 - FORGET * 0.5)
 
 
 def test_a_vehicle_with_priority_needs_nobody() -> None:

@@ -14,7 +14,9 @@ from run_rows import CASE, begin, cell, failed, row, write
 from cosim.cli.main import main
 from cosim.errors import BadInput
 from cosim.report import html as report
+from cosim.report.html import tables
 from cosim.report.run_folder import read
+from cosim.report.summary import GROUP
 
 VOID = {"meta", "br", "link", "img", "hr", "input"}
 
@@ -112,6 +114,10 @@ def test_a_crashed_simulation_is_listed_with_its_stderr(full: tuple[Path, Page])
     assert "Error: no such junction" in text
     assert "seed 200010" in text
     assert "1 of 31 episodes gave no figures" in text
+
+
+def test_whatever_cells_share_has_a_title() -> None:
+    assert {*GROUP} <= {*tables.TITLES}
 
 
 def test_plots_take_the_theme_of_the_page(full: tuple[Path, Page]) -> None:

@@ -328,6 +328,23 @@ def test_along_a_lane_a_track_drives_round_the_bend() -> None:
     assert math.hypot(world.x[row] - 100.0, world.y[row] - 50.0) == pytest.approx(50.0, abs=0.1)
 
 
+def test_noise_moves_nobody_over_the_line_where_it_stands() -> None:
+    before, beyond = (np.array([[x, 0.0], [x + 100.0, 0.0]]) for x in (0.0, 100.0))
+    lanes = Lane("a_0", "a", 0, before, 100.0, 3.2, 20.0, (1,)), Lane("b_0", "b", 0, beyond, 100.0, 3.2, 20.0)
+    truth = snapshot([EGO, Car("v", 97.4, speed=0.0, lane=0)], 0.0)
+    truth = replace(truth, y=np.zeros(2), lane=np.zeros(2, np.int32))
+    perception = Perception(RoadMap(lanes), replace(levels()["v2v"], miss=0.0, loss=0.0), Timing(), 1)
+    places = []
+    for k in range(100):
+        world = perception.perceive(replace(truth, time=k * FRAME))["ego"].world
+        if "v" in world.row:
+            row = world.row["v"]
+            places.append((int(world.lane[row]), float(world.lane_position[row])))
+    assert len(places) > 90
+    assert {lane for lane, _ in places} == {0}
+    assert 99.0 < float(np.mean([position for _, position in places])) < 100.0
+
+
 # ---- messages ----
 
 

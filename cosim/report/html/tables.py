@@ -22,6 +22,7 @@ TITLES = {
     "penetration": "penetration",
     "preset": "preset",
     "errors": "human errors",
+    "sensing": "sensing",
     "svo_deg": "SVO",
     "driver_model": "drivers",
     "collision_rate": "collisions",

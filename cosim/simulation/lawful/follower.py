@@ -22,6 +22,7 @@ EVASION_HEADWAYS = (1.5, 0.2), (3.0, 0.5)  # (s to contact, s of headway), linea
 MIN_EVASION_TIME = 1.0  # s
 WARNING_RANGE = 8.0, 30.0  # s to contact of a warned AV; m, the largest gap in the queue up to it
 HEADWAY_RECOVERY = 0.1  # s of headway regained per s
+ESTIMATE_LAG = 0.5  # s by which estimates of a human's braking lag, unless sensing is ideal
 
 
 class Follower(Rule):
@@ -33,6 +34,7 @@ class Follower(Rule):
         # AV -> s until contact with an inattentive human further back
         self._new_warnings: dict[str, float] = {}
         self._warnings = self._new_warnings  # of the previous step
+        self._suspected: dict[str, tuple[str, float]] = {}  # AV -> human that seems inattentive, since s
 
     def begin_step(self) -> None:
         """Begin a simulation step."""
@@ -56,6 +58,10 @@ class Follower(Rule):
         self._driver.set_late_braking(car.name, late)
         return NO_LIMIT
 
+    def drop(self, name: str) -> None:
+        """The AV is no longer commanded."""
+        self._suspected.pop(name, None)
+
     # ---- inside ----
 
     def _human_follower(self, car: Car) -> tuple[str, float] | None:
@@ -73,15 +79,25 @@ class Follower(Rule):
 
     def _time_to_contact(self, car: Car, follower: str, gap: float) -> float:
         """s until contact with an inattentive human `gap` m behind; inf if the human brakes or is slower."""
-        seen = self._eyes.view(car.name)
-        closing = seen.getSpeed(follower) - car.speed
-        if closing <= 0.0 or gap >= INATTENTION[0] * closing:
+        speed = self._eyes.view(car.name).getSpeed(follower)
+        closing = speed - car.speed
+        near = closing > 0.0 and gap < INATTENTION[0] * closing
+        if not near or not self._is_inattentive(car, follower, closing, gap):
+            self._suspected.pop(car.name, None)
             return math.inf
-        needed = closing**2 / (2.0 * gap) + max(-sumo.vehicle.getAcceleration(car.name), 0.0)
-        if needed < EVASION_DECELS[car.evading] or -seen.getAcceleration(follower) > INATTENTION[1] * needed:
+        whose, since = self._suspected.get(car.name, (follower, car.now))
+        since = since if whose == follower else car.now
+        self._suspected[car.name] = follower, since
+        if car.now - since < ESTIMATE_LAG and not (self._eyes.ideal or car.evading):
             return math.inf
-        self._warn_avs_ahead(car.name, seen.getSpeed(follower), gap)
+        self._warn_avs_ahead(car.name, speed, gap)
         return float(gap / closing)
+
+    def _is_inattentive(self, car: Car, follower: str, closing: float, gap: float) -> bool:
+        """Whether the human, `gap` m behind and `closing` (m/s), brakes too little to avoid contact."""
+        braking = -self._eyes.view(car.name).getAcceleration(follower)
+        needed = closing**2 / (2.0 * gap) + max(-sumo.vehicle.getAcceleration(car.name), 0.0)
+        return bool(needed >= EVASION_DECELS[car.evading] and braking <= INATTENTION[1] * needed)
 
     def _warn_avs_ahead(self, name: str, speed: float, distance: float) -> None:
         """Warn the AVs ahead, past other vehicles, of a human at `speed` m/s, `distance` m behind `name`."""

@@ -14,7 +14,7 @@ from stable_baselines3 import DQN
 from cosim.envs.gym import nearest_upstream
 from cosim.envs.spaces import observation
 from cosim.observation.view import views
-from cosim.types import COMPACT, History, PolicyContext
+from cosim.types import History, ObservationConfig, PolicyContext
 
 
 class Dqn:
@@ -23,7 +23,7 @@ class Dqn:
     In training it commanded the AV in conflict with the mission vehicle.
     """
 
-    observation = COMPACT  # as in training
+    observation = ObservationConfig(maps=False)  # as in training
 
     def __init__(self) -> None:
         model = Path(os.environ.get("SB3_MODEL", "runs/sb3-dqn.zip")).absolute()

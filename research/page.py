@@ -184,6 +184,8 @@ def _differences(found: Found, here: Sequence[Condition]) -> Iterator[list[str]]
     others = claim.compare.against if len(claim.compare.against) <= FEW else claim.compare.against[:1]
     for metric, against in itertools.product(claim.secondary, others):
         pairs = [found.difference(condition, against, metric) for condition in here]
+        if not any(pair.n for pair in pairs):  # for example figures of AVs against an arm without any
+            continue
         name = f"{_column_head(found.measures[metric], '%')} of {claim.compare.arm}; difference to {against}"
         yield [name, _span(p.n for p in pairs), *about, *map(_level, pairs)]
 

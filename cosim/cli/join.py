@@ -30,7 +30,7 @@ def add(commands: arguments.SubCommands) -> None:
         "drive some of its vehicles as AVs, and hand them back. Ctrl-C leaves it in order.",
     )
     join.add_argument("place", metavar="HOST:PORT", type=_place, help="where it listens")
-    theirs = [o.name for o in OPTIONS.values() if o.scope == TRAFFIC or o.field == "outputs"]
+    theirs = [o.name for o in OPTIONS.values() if o.scope == TRAFFIC or o.field in ("outputs", "sensing")]
     arguments.options(
         join,
         without=theirs,

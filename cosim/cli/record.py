@@ -13,7 +13,7 @@ def add(commands: arguments.SubCommands) -> None:
         description="Drive every combination of scenario, demand, behaviour, policy and seed on worker "
         "processes; one Parquet file per episode.",
     )
-    arguments.options(record, matrix=True, without=("output", "metric", "reward"))
+    arguments.options(record, matrix=True, without=("output", "metric", "reward", "sensing"))
     arguments.add(record, "--seeds", type=arguments.seeds, required=True)
     arguments.add(record, "--resume")
     arguments.add(record, "--out", required=True)

@@ -153,7 +153,7 @@ def no_av(seed: int, name: str | None) -> BadInput:
     if name is not None:
         return BadInput(f"this AV was never on the road in episode {seed}", field="learner", value=name)
     return BadInput(
-        "no AV was ever on the road: give fleet=Fleet(penetration=...) or a demand with AVs",
+        "no AV was ever on the road: give penetration=0.2, the share of AVs, or a demand with AVs",
         field="seed",
         value=seed,
     )

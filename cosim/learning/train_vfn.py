@@ -16,6 +16,7 @@ from cosim.learning.announcement import Announced, begin
 from cosim.learning.configuration import configuration
 from cosim.learning.rollouts import Rollouts
 from cosim.metrics import read as read_metric
+from cosim.rewards import REWARDS, RewardConfig
 from cosim.rewards import read as read_reward
 from cosim.scenario import human_errors, load, place
 from cosim.scenario.manifest import digests
@@ -59,7 +60,7 @@ def train(args: argparse.Namespace) -> int:
         keep_freed_memory()
         use_threads(args.threads)  # more threads than cores stall each other (docs/guides/training.md)
         writer = tensorboard(folder)
-        rollouts = Rollouts(args.workers, name, agent, file.explore, reward or file.reward, metrics)
+        rollouts = Rollouts(args.workers, name, agent, file.explore, paid(reward, file.reward), metrics)
         wanted = 0 if agent.vfn.critic else training.prefill  # decisions before the first update
         begin(name, training, wanted, shlex.quote(args.out))
         with closing(writer), Progress(f"train {name}", "iterations") as progress, rollouts as actors:
@@ -90,6 +91,12 @@ def _scheduled(training: VfnTraining, args: argparse.Namespace) -> VfnTraining:
     given = {field: getattr(args, field) for field in ("iterations", "seed")}
     changes = {field: value for field, value in given.items() if value is not None}
     return replace(training, errors=errors or "", **changes)
+
+
+def paid(reward: str, weights: RewardConfig) -> str | RewardConfig:
+    """The reward of `--reward`: one of ours with the configuration's weights, the user's, or ("") the
+    configuration's."""
+    return replace(weights, variant=reward) if reward in REWARDS else reward or weights
 
 
 def _user_code(

@@ -12,6 +12,7 @@ from cosim.observation.view import View, views
 from cosim.scenario.policy_name import PolicyName
 from cosim.types import (
     COMPACT,
+    ContinuousAction,
     Decision,
     History,
     LookAhead,
@@ -79,11 +80,13 @@ class OwnPolicy:
         return found
 
     def _decision(self, value: Any) -> Decision:
+        if isinstance(value, ContinuousAction):
+            value = Decision(value.lane_change, accel=value.accel)
         whole: Decision = value if isinstance(value, Decision) else Decision(value)
         try:
             return whole._replace(action=MetaAction(operator.index(whole.action)))
         except (TypeError, ValueError):
-            problem = f"must decide for a Decision, a MetaAction ({ACTIONS}) or None"
+            problem = f"must decide for a Decision, a MetaAction ({ACTIONS}), a ContinuousAction or None"
             raise self._wrong(problem, "decide", value) from None
 
     def _wrong(self, problem: str, field: str, value: object = None) -> BadInput:

@@ -6,6 +6,7 @@ Nothing is unpickled, so a server cannot run code in the client.
 from __future__ import annotations
 
 import json
+import math
 import typing
 from collections.abc import Mapping
 from dataclasses import asdict, fields
@@ -21,7 +22,7 @@ from cosim.errors import BadInput
 from cosim.observation.view import Packed
 from cosim.rewards import RewardTerms
 from cosim.scenario.options import COLUMNS
-from cosim.types import IDENTITY, Collision, Due, EpisodeResult, Events, Metric, Receipt, Snapshot
+from cosim.types import IDENTITY, Collision, Due, EpisodeResult, Events, HumanError, Metric, Receipt, Snapshot
 
 MEDIA = "application/vnd.cosim.step"  # accepted by clients that want bytes
 _DOCUMENT = "document"  # the key of the metadata
@@ -129,6 +130,9 @@ def to_result(document: Mapping[str, Any]) -> EpisodeResult:
         asked={name: document[name] for name in COLUMNS if name in document},
         interventions_by_reason=document["interventions_by_reason"],
         manifest=document["manifest"],
+        errors_begun=tuple(
+            HumanError(time, who, kind, math.nan, "") for kind, who, time in document["human_error_list"]
+        ),
     )
 
 

@@ -47,10 +47,12 @@ def same(a: Any, b: Any) -> bool:
 
 
 def test_a_remote_session_is_the_local_one_to_the_last_bit(server: Server) -> None:
-    with client.open(server.url, "merge", **WORDS) as remote, cosim.open("merge", **WORDS) as local:
+    words = WORDS | {"errors": "stress"}
+    with client.open(server.url, "merge", **words) as remote, cosim.open("merge", **words) as local:
         assert same(drive(remote, 7), drive(local, 7))
         ours, theirs = local.result().document(), remote.result().document()
         assert ours | {"timings": 0} == theirs | {"timings": 0}
+        assert ours["human_errors_by_kind"]
         assert remote.scenario.duration == local.scenario.duration
         with pytest.raises(BadInput, match="the episode is over"):
             remote.act({})

@@ -30,7 +30,7 @@ from policy.training.config import agent_config, described
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SEED = "200061"
 CODE = """
-from cosim.types import COMPACT, SMOKE, Decision, MetaAction, ObservationConfig
+from cosim.types import COMPACT, SMOKE, ContinuousAction, Decision, MetaAction, ObservationConfig
 
 class Holds:
     observation = ObservationConfig(maps=False)
@@ -73,6 +73,12 @@ class Prints(Holds):
     def answer(self, av):
         print("hello")
         return 1
+
+class Eases(Holds):
+    def answer(self, av): return ContinuousAction(-0.5, 1)
+
+class EasesToo(Holds):
+    def answer(self, av): return Decision(MetaAction.LANE_LEFT, accel=-0.5)
 
 class Nothing: ...
 
@@ -150,14 +156,19 @@ def test_a_class_a_factory_and_a_function_of_ones_own_drive(code: Path, tmp_path
     assert results[0]["trace_hash"] == results[1]["trace_hash"] == ours["trace_hash"]
     assert make(f"{code}:looks").observation == COMPACT  # maps, unless it says otherwise: SUMO drives here
     assert results[2]["trace_hash"] == run("idm", tmp_path / "idm", *unguarded)["trace_hash"]
+    eased, too = (run(f"{code}:{name}", tmp_path / name)["trace_hash"] for name in ("Eases", "EasesToo"))
+    assert eased == too != run("idm", tmp_path / "lawful")["trace_hash"]
 
 
 @pytest.mark.parametrize(
     ("name", "said"),
     [
         ("Raises", "code.py:12: decide: ZeroDivisionError"),
-        ("Text", "decide='left': must decide for a Decision, a MetaAction (0 to 4) or None"),
-        ("Wrapped", "must decide for a Decision, a MetaAction (0 to 4) or None"),
+        (
+            "Text",
+            "decide='left': must decide for a Decision, a MetaAction (0 to 4), a ContinuousAction or None",
+        ),
+        ("Wrapped", "must decide for a Decision, a MetaAction (0 to 4), a ContinuousAction or None"),
         ("Filed", "Filed.files='nowhere.zip': no such file"),
         ("Numbered", "Numbered.av_parameters=('lcSpeedGain', 3): must map SUMO's parameters to text"),
         ("Leaves", "decide: SystemExit: 3"),

@@ -267,7 +267,7 @@ def test_a_learner_that_leaves_the_road_truncates(make: Make) -> None:
 
 
 def test_without_any_av_the_error_says_how_to_get_one(make: Make) -> None:
-    with pytest.raises(BadInput, match=r"no AV was ever on the road.*fleet"):
+    with pytest.raises(BadInput, match=r"no AV was ever on the road.*penetration"):
         make(fake_worlds.nobody).reset(seed=1)
     with pytest.raises(BadInput, match=r"learner='nobody'.*never on the road"):
         make(fake_worlds.platoon, learner="nobody").reset(seed=1)

@@ -52,9 +52,10 @@ class ContinuousAction(NamedTuple):
     lane_offset: int = 0
 
     @property
-    def lane_change(self) -> MetaAction:
-        """The meta-action of this lane change; IDLE without a lane change."""
-        return {1: MetaAction.LANE_LEFT, -1: MetaAction.LANE_RIGHT}.get(self.lane_offset, MetaAction.IDLE)
+    def decision(self) -> Decision:
+        """The same with a meta-action for the lane change: IDLE without one."""
+        offsets = {1: MetaAction.LANE_LEFT, -1: MetaAction.LANE_RIGHT}
+        return Decision(offsets.get(self.lane_offset, MetaAction.IDLE), accel=self.accel)
 
 
 class Kind(IntEnum):

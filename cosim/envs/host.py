@@ -196,9 +196,7 @@ class SessionHost(Host):
 
 
 def _decision(action: int | ContinuousAction) -> Decision:
-    if isinstance(action, ContinuousAction):
-        return Decision(action.lane_change, accel=action.accel)
-    return Decision(MetaAction(action))
+    return action.decision if isinstance(action, ContinuousAction) else Decision(MetaAction(action))
 
 
 def _common(observation: ObservationConfig, others: Policy) -> ObservationConfig:

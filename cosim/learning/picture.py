@@ -14,6 +14,5 @@ def save(figure: Figure, path: Path) -> None:
     """Write the figure with a palette. OSErrors are not caught."""
     drawn = io.BytesIO()
     figure.savefig(drawn, format="png", dpi=DPI)
-    Image.open(drawn).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(
-        path, "png", optimize=True
-    )
+    picture = Image.open(drawn).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
+    picture.save(path, "png", optimize=True)

@@ -60,7 +60,8 @@ def train(args: argparse.Namespace) -> int:
         keep_freed_memory()
         use_threads(args.threads)  # more threads than cores stall each other (docs/guides/training.md)
         writer = tensorboard(folder)
-        rollouts = Rollouts(args.workers, name, agent, file.explore, paid(reward, file.reward), metrics)
+        earned = chosen_reward(reward, file.reward)
+        rollouts = Rollouts(args.workers, name, agent, file.explore, earned, metrics)
         wanted = 0 if agent.vfn.critic else training.prefill  # decisions before the first update
         begin(name, training, wanted, shlex.quote(args.out))
         with closing(writer), Progress(f"train {name}", "iterations") as progress, rollouts as actors:
@@ -93,7 +94,7 @@ def _scheduled(training: VfnTraining, args: argparse.Namespace) -> VfnTraining:
     return replace(training, errors=errors or "", **changes)
 
 
-def paid(reward: str, weights: RewardConfig) -> str | RewardConfig:
+def chosen_reward(reward: str, weights: RewardConfig) -> str | RewardConfig:
     """The reward of `--reward`: one of ours with the configuration's weights, the user's, or ("") the
     configuration's."""
     return replace(weights, variant=reward) if reward in REWARDS else reward or weights

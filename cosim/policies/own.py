@@ -81,7 +81,7 @@ class OwnPolicy:
 
     def _decision(self, value: Any) -> Decision:
         if isinstance(value, ContinuousAction):
-            value = Decision(value.lane_change, accel=value.accel)
+            value = value.decision
         whole: Decision = value if isinstance(value, Decision) else Decision(value)
         try:
             return whole._replace(action=MetaAction(operator.index(whole.action)))

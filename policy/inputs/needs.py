@@ -79,7 +79,7 @@ class Needs:
         told = {av: waiting.tell() for av, waiting in self._waiting.items()}
         for av, history in histories.items():
             waiting = self._waiting.setdefault("" if self._pooled else av, Waiting())
-            for other in sorted(history.hears or ()):
+            for other in history.hears or ():  # in any order: the longest count remains
                 waiting.hear(told.get(other, {}), history.time)
             needs = self._of(history, waiting)
             if needs:

@@ -12,7 +12,7 @@ import yaml
 
 from cosim.errors import BadInput
 from cosim.learning.configuration import configuration
-from cosim.learning.train_vfn import paid
+from cosim.learning.train_vfn import chosen_reward
 from cosim.rewards import RewardConfig
 from cosim.types import COMPACT
 from policy.agents.approaches import configure
@@ -97,6 +97,6 @@ def test_a_training_has_at_most_sixty_fields() -> None:
 
 def test_a_named_reward_has_the_weights_of_the_configuration() -> None:
     weights = RewardConfig(mission=200.0, social=0.02)
-    assert paid("t", weights) == replace(weights, variant="t")
-    assert paid("", weights) == weights
-    assert paid("mine.py:Reward", weights) == "mine.py:Reward"
+    assert chosen_reward("t", weights) == replace(weights, variant="t")
+    assert chosen_reward("", weights) == weights
+    assert chosen_reward("mine.py:Reward", weights) == "mine.py:Reward"

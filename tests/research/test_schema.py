@@ -18,10 +18,13 @@ OF_THE_CAR = (
     "forced_entry",
     "humans",
     "label_free",
+    "penetration",
     "saturated",
     "saturated_car",
     "saturated_junctions",
     "saturated_v2v",
+    "svo",
+    "yielding_delay",
     "yielding_safety",
 )
 EVERYBODY = ("total_delay_s", "total_delay_av_s", "total_delay_hv_s", "longest_wait_s")

@@ -9,7 +9,7 @@ COMPILE = $(BIN)/python -W ignore -m compileall -qq -j 0 -x '/tests?/|/sumo/' $(
 RUN ?= runs/demo
 SCALE ?= 1
 WORKERS ?= 2
-SAMPLE ?= 20
+SAMPLE ?= 30
 PROCESSES ?= 2
 # The tests of a file stay in one process, in the order of the folders, long files first. One thread per process.
 PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(PROCESSES) --dist loadfile --no-loadscope-reorder --durations=40 --durations-min=2
@@ -67,7 +67,7 @@ results: $(VENV)/.installed-dev
 pages: $(VENV)/.installed-dev
 	$(BIN)/python -m research page
 
-# Drives a sample of the kept episodes again and compares every figure and the trace hash.
+# Drives a sample of the kept episodes again, of every kind, and compares every figure and the trace hash.
 audit: $(VENV)/.installed-dev
 	$(BIN)/python -m research audit --sample $(SAMPLE) --workers $(WORKERS)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
@@ -28,17 +29,30 @@ class Audited:
 
 
 def audit(work: Work, settings: Settings, sample: int, pick: int = 0) -> Audited:
-    """Drive `sample` of the kept episodes, drawn with the seed `pick`, and compare every column."""
+    """Drive `sample` of the kept episodes, drawn with the seed `pick`, and compare every column.
+
+    No kind of episode (policy, preset, sensing) is drawn twice before every kind is drawn once.
+    """
     rows = kept.episodes(settings.kept).rows
     known = [row for row in rows if row["cell"] in work.wanted]
-    picked = random.Random(pick).sample(known, min(sample, len(known)))
-    picked.sort(key=lambda row: row["key"])  # group the episodes of a cell
+    picked = sorted(_drawn(known, sample, pick), key=lambda row: row["key"])  # a cell's episodes in a row
     again = _driven(picked, work, settings)
     differing = tuple(line for row in picked for line in _differences(row, again[row["key"]]))
     return Audited(len(picked), differing, len(rows), len(rows) - len(known))
 
 
 # ---- inside ----
+
+
+def _drawn(rows: list[Row], sample: int, pick: int) -> list[Row]:
+    """A random sample of every kind of episode in turn, so that no policy or sensing is missed."""
+    met: Counter[tuple[Any, ...]] = Counter()
+    turns = []
+    for row in random.Random(pick).sample(rows, len(rows)):
+        kind = row["policy"], row["preset"], row["sensing"]
+        turns.append((met[kind], row))
+        met[kind] += 1
+    return [row for _, row in sorted(turns, key=lambda turn: turn[0])[:sample]]
 
 
 def _driven(rows: list[Row], work: Work, settings: Settings) -> dict[str, dict[str, Any]]:

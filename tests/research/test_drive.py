@@ -171,6 +171,13 @@ def test_a_kept_episode_that_is_not_the_same_again_is_found_and_named(
     assert audit.audit(other, replace(settings, kept=tmp_path), 5) == audit.Audited(0, (), 1, 1)
 
 
+def test_an_audit_misses_no_kind_of_episode() -> None:
+    many = [{"key": str(i), "policy": "idm", "preset": "lawful", "sensing": None} for i in range(50)]
+    rare = {"key": "rare", "policy": "idm", "preset": "lawful", "sensing": "v2v"}
+    for pick in range(5):
+        assert rare in audit._drawn([*many, rare], 2, pick)
+
+
 def test_what_collisions_tell_today_besides_is_no_difference() -> None:
     row = {"key": "k", "policy": "p", "scenario": "w", "seed": 1, "status": "ok"}
     before = row | {"collision_list": '[{"collider": "a", "victim": "b"}]'}

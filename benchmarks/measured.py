@@ -168,6 +168,12 @@ def front(place: Place) -> list[list[str]]:
     return [["benchmarks.front", *few, "--out", str(place.out)]]
 
 
+def earlier_car(place: Place) -> list[list[str]]:
+    """The lawful car beside an earlier one."""
+    few = ["--commit", "HEAD", "--scenario", "minor", "--seeds", "100000:100001", "--duration", "30"]
+    return [["benchmarks.earlier_car", *(few if place.small else []), "--out", str(place.out)]]
+
+
 def yielding(place: Place) -> list[list[str]]:
     """Scripted yielding beside the lawful car."""
     few = ["--each", "1", "--kinds", "weave", "--duration", "30"] if place.small else []
@@ -189,6 +195,7 @@ PAGES = (
     ),
     Page("capacity", capacity, ("capacity.md", "capacity.svg", "data/capacity.csv")),
     Page("front", front, ("front.md", "front.svg", "data/front.csv")),
+    Page("earlier_car", earlier_car, ("earlier_car.md", "data/earlier_car.csv")),
     Page("yielding", yielding, ("yielding.md", "data/yielding.csv")),
     Page("law", law, ("law.md",)),
     Page("agent", agent, ("agent.md",)),

@@ -43,6 +43,7 @@ class Line(NamedTuple):
     p_holm: float | None = None
     preset: str = ""
     errors: str = ""
+    sensing: str = ""
     drivers: str = ""
     policy: str = ""
     weights: str = ""
@@ -54,6 +55,7 @@ class Traffic(NamedTuple):
 
     preset: str
     errors: str  # of the human drivers
+    sensing: str  # of the AVs
     drivers: str  # the human drivers' behavior
 
 
@@ -191,7 +193,8 @@ def figure(measure: Measure, rows: Sequence[Row]) -> Figure:
 def traffic_of(arm: Arm) -> Traffic:
     """The traffic of an arm's episodes."""
     row = arm.rows[0]
-    return Traffic(str(row["preset"]), str(row.get("errors") or "none"), str(row["behavior"]))
+    errors, sensing = row.get("errors") or "none", row.get("sensing") or "ideal"
+    return Traffic(str(row["preset"]), str(errors), str(sensing), str(row["behavior"]))
 
 
 # ---- inside ----
@@ -201,11 +204,10 @@ def _line(
     condition: Condition, arm: Arm, what: tuple[str, str, str, str], shown: Figure, counts: tuple[int, int]
 ) -> Line:
     """A figure of `arm`, or its difference from another arm. `what`: arm, against, figure and unit."""
-    here = traffic_of(arm)
     return Line(
         *(condition.scenario, condition.text, *what),
         *(shown.value, shown.low, shown.high, *counts),
-        *(None, None, here.preset, here.errors, here.drivers),
+        *(None, None, *traffic_of(arm)),
         *(policy(arm.cell), arm.weights, arm.definitions),
     )
 

@@ -23,6 +23,9 @@ from research.schema import Condition
 OUT = Path("docs/results")
 FEW = 2  # arms to compare with, so that the secondary figures are shown against each
 WIDTH = 100  # columns of prose
+# Columns of a table before the scenarios: head -> the option that the title of a block may give instead
+COLUMNS = {"n": "", "preset": "preset", "errors": "errors", "sensing": "sensing", "drivers": "behavior"}
+COLUMNS |= {"weights": ""}
 TESTS = {"mcnemar": "McNemar's exact test", "signed_rank": "Wilcoxon's signed ranks"}
 WORDS = {"yes": "Yes.", "no": "No.", "not resolved": "Not resolved."}
 
@@ -45,10 +48,15 @@ def lines(found: Found, settings: Settings) -> list[str]:
         f"Made by `python -m research page {claim.name}{flags(settings)}` from "
         f"`research/claims/{claim.name}.yaml` ({claim.digest}); figures in `data/{claim.name}.csv`."
     )
+    rows, same = table(found)
     return [
         *(f"# {claim.sentence}", "", *wrapped(verdict(found)), ""),
-        *(*table(found), "", f"![{claim.name}]({claim.name}.svg)", ""),
-        *(line for text in filter(None, (claim.note, *about, command)) for line in (*wrapped(text), "")),
+        *(*rows, "", f"![{claim.name}]({claim.name}.svg)", ""),
+        *(
+            line
+            for text in filter(None, (same, claim.note, *about, command))
+            for line in (*wrapped(text), "")
+        ),
     ]
 
 
@@ -73,13 +81,16 @@ def verdict(found: Found) -> str:
     )
 
 
-def table(found: Found) -> list[str]:
-    """A row for every arm and difference, a column for every scenario; block by block of the matrix."""
+def table(found: Found) -> tuple[list[str], str]:
+    """A row for every arm and difference, a column for every scenario; block by block of the matrix.
+
+    Also a sentence of the columns that are left out because they are equal in all rows.
+    """
     claim = found.claim
     primary = found.measures[claim.primary.metric]
     scenarios = list(dict.fromkeys(condition.scenario for condition, _ in found.arms))
-    heads = [_column_head(primary, "%"), "n", "preset", "errors", "drivers", "weights", *scenarios]
-    rows = [heads, ["---"] * len(heads)]
+    heads = [_column_head(primary, "%"), *COLUMNS, *scenarios]
+    rows = []
     for values in dict.fromkeys(condition.values for condition, _ in found.arms):
         here = [Condition(scenario, values) for scenario in scenarios]
         if text := here[0].text:
@@ -88,7 +99,12 @@ def table(found: Found) -> list[str]:
             figures = (_figure_cell(found, condition, arm) for condition in here)
             rows.append([_arm_name(found, here[0], arm), *_arm_cells(found, here, arm), *figures])
         rows += _differences(found, here)
-    return [f"| {' | '.join(row)} |" for row in rows]
+    same = dict(_same(rows))
+    titled = {number for number, option in enumerate(COLUMNS.values(), 1) if option in claim.matrix}
+    kept = [number for number, _ in enumerate(heads) if number not in {*same, *titled}]
+    shown = [[row[number] for number in kept] for row in (heads, ["---"] * len(heads), *rows)]
+    about = ", ".join(f"{heads[number]} {value}" for number, value in same.items() if value != "-")
+    return [f"| {' | '.join(row)} |" for row in shown], f"In all rows: {about}." if about else ""
 
 
 def conditions(found: Found, settings: Settings) -> str:
@@ -152,6 +168,14 @@ def write_csv(path: Path, found: Iterable[Line]) -> None:
 
 
 # ---- inside ----
+
+
+def _same(rows: Sequence[Sequence[str]]) -> Iterator[tuple[int, str]]:
+    """Columns about episodes that have one value in all rows: number and value. Block titles are empty."""
+    for number in range(1, 1 + len(COLUMNS)):
+        values = {row[number] for row in rows} - {""}
+        if len(values) == 1:
+            yield number, values.pop()
 
 
 def _arm_name(found: Found, condition: Condition, name: str) -> str:

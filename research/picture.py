@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,7 @@ from research.schema import Condition
 
 TICKS = (0.0, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # %
 STYLE: Any = {"svg.fonttype": "none", "svg.hashsalt": "cosim", "font.size": 9.0}  # equal figures, equal file
+CLIP = re.compile(r"\bp[0-9a-f]{10}\b")  # hash of a clip's exact size, whose last bits depend on the machine
 
 
 def draw(found: Found, path: Path) -> None:
@@ -27,9 +30,13 @@ def draw(found: Found, path: Path) -> None:
 
 def save(picture: Picture, path: Path) -> None:
     """Write the picture as SVG; equal figures give an equal file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    drawn = io.StringIO()
     with rc_context(STYLE):
-        picture.savefig(path, metadata={"Date": None, "Creator": None})
+        picture.savefig(drawn, format="svg", metadata={"Date": None, "Creator": None})
+    numbers: dict[str, str] = {}
+    text = CLIP.sub(lambda found: numbers.setdefault(found[0], f"clip{len(numbers)}"), drawn.getvalue())
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
 
 
 # ---- inside ----

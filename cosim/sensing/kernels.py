@@ -669,7 +669,7 @@ def believe(
             many += 1
             heading, lane, position = track[T_HEADING], int(track[T_LANE]), track[T_POSITION]
             if lane >= 0:  # noise alone does not carry an object over the end of its lane
-                position = min(position, lane_length[lane] - math.sqrt(track[T_XX]))
+                position = max(min(position, lane_length[lane] - math.sqrt(track[T_XX])), 0.0)
             speed = max(track[T_VX] * math.cos(heading) + track[T_VY] * math.sin(heading), 0.0)
             x, y, age = track[T_X], track[T_Y], now - track[T_TIME]
             belief[B_AGE], belief[B_SOURCE], belief[B_TOLD] = age, track[T_SOURCE], track[T_TOLD]

@@ -191,7 +191,7 @@ def test_who_has_waited_long_takes_no_gap_that_a_human_has_to_brake_for(
     assert result.value("right_of_way_violations") == 0
 
 
-@pytest.mark.parametrize("seed", [150_006, 150_043])
+@pytest.mark.parametrize("seed", [150_035, 150_043])
 def test_who_has_waited_long_goes_before_those_who_stand_opposite(
     law_worlds: dict[str, Path], seed: int
 ) -> None:
@@ -326,6 +326,26 @@ def test_it_comes_to_a_stop_comfortably_and_does_not_creep_there(start: Start) -
     assert slow[-1] < 0.1
     assert np.diff(slow).min() > -2.0 * frame
     assert sum(v > 0.1 for v in slow) * frame < 3.0  # s
+
+
+def test_it_drives_as_fast_as_the_agent_asks_and_no_faster(start: Start) -> None:
+    """SUMO's driver, left alone for single steps, would accelerate up to the speed limit."""
+    worker = start([vehicle("av", "av", 20.0, speed=8.0)], preset=Preset.LAWFUL)
+    speeds = []
+    for _ in range(25):
+        frames = worker.call("advance", [Command("av", 12.0, 0, 0.4)])[1]
+        speeds += [frame.speed[frame.row["av"]] for frame in frames]
+
+    assert max(speeds) < 12.1
+    assert speeds[-1] > 11.8
+    assert np.abs(np.diff(speeds, 2)).max() < 1.1 * MAX_JERK * (2.0 * STEP) ** 2
+
+
+def test_it_follows_a_small_acceleration(start: Start) -> None:
+    worker = start([vehicle("av", "av", 20.0, speed=8.0)], preset=Preset.LAWFUL)
+    frames = [worker.call("advance", [Command("av", 30.0, 0, 0.4, accel=0.3)])[1][-1] for _ in range(15)]
+    speeds = [frame.speed[frame.row["av"]] for frame in frames]
+    assert np.diff(speeds[1:]) == pytest.approx(0.3 * 0.4, abs=0.03)
 
 
 def test_what_the_agent_wishes_is_comfortable_and_its_jerk_bounded() -> None:

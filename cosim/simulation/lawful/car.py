@@ -15,7 +15,7 @@ class Limit(NamedTuple):
     reason: str = ""  # "" for the agent's own wish
 
 
-TOLERANCE = 1e-3  # m/s: SUMO's driver may be this much slower and the wish still counts as driven
+TOLERANCE = 1e-3  # m/s: SUMO's driver may be this much slower and the command still counts as driven
 LAW = "law"  # the reason of a limit that SUMO's driver drives by itself
 NO_LIMIT = Limit(math.inf)  # the output of a rule that does not apply
 
@@ -66,9 +66,11 @@ class Car(Controlled):
         self.in_junction = self.lane.startswith(":")
         position = get.getLanePosition(self.name)
         self.to_line = sumo.lane.getLength(self.lane) - position if self.lane else math.inf
-        # SUMO's driver is taken to keep its acceleration. SUMO may start a standing driver at any time.
-        expected = max(2.0 * self.speed - self.last_speed, 0.0)
-        self.driver_speed = (get.getSpeedWithoutTraCI(self.name) if self.commanded else expected) + TOLERANCE
+        if self.commanded:  # a driver that would be faster is read as driving the command
+            driver = get.getSpeedWithoutTraCI(self.name)
+            self.driver_speed = driver if driver < self.requested - TOLERANCE else math.inf
+        else:  # it is taken to keep its acceleration; SUMO may start a standing driver at any time
+            self.driver_speed = max(2.0 * self.speed - self.last_speed, 0.0) + TOLERANCE
 
 
 class Rule:

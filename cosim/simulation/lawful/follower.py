@@ -44,6 +44,8 @@ class Follower(Rule):
         """No limit: the leader rule applies the headway that is set here."""
         headway = car.headway
         human = self._human_follower(car)
+        if human is None:
+            self._suspected.pop(car.name, None)
         warned = self._warnings.get(car.name, math.inf)
         contact = warned if human is None else min(self._time_to_contact(car, *human), warned)
         if contact < math.inf:

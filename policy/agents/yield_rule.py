@@ -15,12 +15,14 @@ EASES_OFF = True  # behind a vehicle that signals onto its lane
 YIELDS_AT_LINES = True  # to a vehicle that has long waited at a line where it gives way to the AV
 
 # Set by hand
-GAPS = 2.0, 40.0  # m to the other's rear, at least and at most: an AV nearer would stand beside it
-EASE = 4.0  # m/s below its speed
-HOLD, REST = 8.0, 6.0  # s of yielding in vain at most, and then without it
-PATIENCE = 5.0  # s that a vehicle has waited at its line
+BEHIND = 10.0  # m to the rear of a vehicle that signals, where the AV has slowed down for it
+EASE = 4.0  # m/s below the speed of that vehicle
+BRAKING = 2.0  # m/s2, with which the AV slows down on the way there
 UPSTREAM = 80.0  # m before its line, where the AV begins at the latest: nearer, it would close the gap itself
-CRAWL = 2.0  # m/s, of the AV while it lets a vehicle go
+SLACK = 1.0  # m/s that the AV may be too fast when it begins
+CRAWL = 2.0  # m/s, the lowest speed of an AV that lets a vehicle go
+PATIENCE = 5.0  # s that a vehicle has waited at its line
+HOLD, REST = 8.0, 6.0  # s of yielding in vain at most, and then without it
 
 
 class YieldRule(Idm):
@@ -43,40 +45,43 @@ class YieldRule(Idm):
         needs = self._needs.find(histories) if self._weight > 0.0 else {}
         now = max((history.time for history in histories.values()), default=0.0)
         self._began = {pair: began for pair, began in self._began.items() if now - began < HOLD + REST}
-        self._guides = self._chosen(needs, now)
+        self._guides = self._chosen(needs, histories, now)
         return {av: self._decision(history, needs.get(av, [])) for av, history in histories.items()}
 
     def _decision(self, history: History, needs: list[Need]) -> Decision:
-        speeds = [self._speed(history, need) for need in needs if self._yields(history, need)]
+        speeds = [self._speed(need) for need in needs if self._yields(history, need)]
         wanted = min(speeds, default=math.inf)
         if wanted > history.ego_speed + EASE:
             return Decision(MetaAction.ACCELERATE)
         return Decision(MetaAction.IDLE, accel=wanted - history.ego_speed)
 
-    def _chosen(self, needs: Mapping[str, list[Need]], now: float) -> dict[tuple[str, int], str]:
-        """For each waiting vehicle and each way across it, the AV that lets it go: the nearest that can."""
+    def _chosen(
+        self, needs: Mapping[str, list[Need]], histories: Mapping[str, History], now: float
+    ) -> dict[tuple[str, int], str]:
+        """For each vehicle and each way across it, the AV that lets it go: the nearest that can."""
         found: dict[tuple[str, int], tuple[bool, float, str]] = {}
         for av, of in needs.items():
             if now < self._rests.get(av, 0.0):
                 continue
             for need in of:
                 key = need.vehicle, need.link
-                held = self._guides.get(key) == av
-                begins = need.crossing and need.waited >= PATIENCE and need.gap >= UPSTREAM
-                if held or begins:
+                held = self._guides.get(key) == av and need.gap > 0.0
+                if held or self._can(histories[av], need):
                     found[key] = min(found.get(key, (True, math.inf, av)), (not held, need.gap, av))
         return {key: av for key, (_, _, av) in found.items()}
+
+    def _can(self, history: History, need: Need) -> bool:
+        """Whether this AV is far enough away to open a gap."""
+        if need.crossing:
+            return YIELDS_AT_LINES and need.waited >= PATIENCE and need.gap >= UPSTREAM
+        return EASES_OFF and need.gap > 0.0 and history.ego_speed <= self._speed(need) + SLACK
 
     def _yields(self, history: History, need: Need) -> bool:
         """Whether the need is this AV's to serve, now, and not in vain for too long."""
         av, now = history.ids[0], history.time
-        if need.crossing:
-            fits = YIELDS_AT_LINES and self._guides.get((need.vehicle, need.link)) == av
-        else:
-            fits = EASES_OFF and not need.between and GAPS[0] <= need.gap <= GAPS[1]
-        began = self._began.get((av, need.vehicle))
-        if not fits or (began is None and now < self._rests.get(av, 0.0)):
+        if self._guides.get((need.vehicle, need.link)) != av:
             return False
+        began = self._began.get((av, need.vehicle))
         if began is None or need.between:  # nobody can use a gap before those ahead of the AV have passed
             began = now
         self._began[av, need.vehicle] = began
@@ -86,6 +91,9 @@ class YieldRule(Idm):
             return False
         return True
 
-    def _speed(self, history: History, need: Need) -> float:
-        """The speed (m/s) that a need asks for."""
-        return CRAWL if need.crossing else max(need.speed - EASE * self._weight, 0.0)
+    def _speed(self, need: Need) -> float:
+        """The speed (m/s) that a need asks for: at a line a crawl, else gently down to the other's pace."""
+        if need.crossing:
+            return CRAWL
+        pace = max(need.speed - EASE * self._weight, CRAWL)
+        return math.sqrt(pace**2 + 2.0 * BRAKING * max(need.gap - BEHIND, 0.0))

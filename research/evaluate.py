@@ -207,8 +207,10 @@ def _line(
     return Line(
         *(condition.scenario, condition.text, *what),
         *(shown.value, shown.low, shown.high, *counts),
-        *(None, None, *traffic_of(arm)),
-        *(policy(arm.cell), arm.weights, arm.definitions),
+        **traffic_of(arm)._asdict(),
+        policy=policy(arm.cell),
+        weights=arm.weights,
+        definitions=arm.definitions,
     )
 
 

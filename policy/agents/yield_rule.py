@@ -38,14 +38,14 @@ class YieldRule(Idm):
         self._weight = min(math.tan(context.svo), 1.0)  # of others, as in the lawful car's courtesy
         self._began: dict[tuple[str, str], float] = {}  # (AV, vehicle) -> s, the begin of yielding
         self._rests: dict[str, float] = {}  # AV -> s, until then it does not begin to yield
-        self._guides: dict[tuple[str, int], str] = {}  # (waiting vehicle, link) -> the AV that lets it go
+        self._serves: set[tuple[str, str, int]] = set()  # AV, vehicle that it lets go, and link over its line
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
         """Accelerate, or the acceleration towards the lowest speed that any need asks for."""
         needs = self._needs.find(histories) if self._weight > 0.0 else {}
         now = max((history.time for history in histories.values()), default=0.0)
         self._began = {pair: began for pair, began in self._began.items() if now - began < HOLD + REST}
-        self._guides = self._chosen(needs, histories, now)
+        self._serves = self._chosen(needs, histories, now)
         return {av: self._decision(history, needs.get(av, [])) for av, history in histories.items()}
 
     def _decision(self, history: History, needs: list[Need]) -> Decision:
@@ -57,18 +57,22 @@ class YieldRule(Idm):
 
     def _chosen(
         self, needs: Mapping[str, list[Need]], histories: Mapping[str, History], now: float
-    ) -> dict[tuple[str, int], str]:
-        """For each vehicle and each way across it, the AV that lets it go: the nearest that can."""
-        found: dict[tuple[str, int], tuple[bool, float, str]] = {}
+    ) -> set[tuple[str, str, int]]:
+        """For each vehicle and each way across it, the nearest AV that can let it go, of those in touch."""
+        able: dict[tuple[str, int], list[tuple[bool, float, str]]] = {}
         for av, of in needs.items():
             if now < self._rests.get(av, 0.0):
                 continue
             for need in of:
-                key = need.vehicle, need.link
-                held = self._guides.get(key) == av and need.gap > 0.0
-                if held or self._can(histories[av], need):
-                    found[key] = min(found.get(key, (True, math.inf, av)), (not held, need.gap, av))
-        return {key: av for key, (_, _, av) in found.items()}
+                serves = (av, need.vehicle, need.link) in self._serves and need.gap > 0.0
+                if serves or self._can(histories[av], need):
+                    able.setdefault((need.vehicle, need.link), []).append((not serves, need.gap, av))
+        return {
+            (av, *key)
+            for key, ranks in able.items()
+            for *_, av in ranks
+            if av == min(rank for rank in ranks if _in_touch(histories[av], rank[2]))[2]
+        }
 
     def _can(self, history: History, need: Need) -> bool:
         """Whether this AV is far enough away to open a gap."""
@@ -79,7 +83,7 @@ class YieldRule(Idm):
     def _yields(self, history: History, need: Need) -> bool:
         """Whether the need is this AV's to serve, now, and not in vain for too long."""
         av, now = history.ids[0], history.time
-        if self._guides.get((need.vehicle, need.link)) != av:
+        if (av, need.vehicle, need.link) not in self._serves:
             return False
         began = self._began.get((av, need.vehicle))
         if began is None or need.between:  # nobody can use a gap before those ahead of the AV have passed
@@ -97,3 +101,8 @@ class YieldRule(Idm):
             return CRAWL
         pace = max(need.speed - EASE * self._weight, CRAWL)
         return math.sqrt(pace**2 + 2.0 * BRAKING * max(need.gap - BEHIND, 0.0))
+
+
+def _in_touch(history: History, other: str) -> bool:
+    """Whether an AV knows what the other one intends, or is that one."""
+    return history.hears is None or other == history.ids[0] or other in history.hears

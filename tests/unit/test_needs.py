@@ -12,7 +12,7 @@ from policy_scenes import LANE_WIDTH, Car, histories, straight_road
 
 from cosim.road import Lane, Link, RoadMap, Rule
 from cosim.types import COMPACT, History, MetaAction, PolicyContext, Timing
-from policy.agents.yield_rule import CRAWL, EASE, HOLD, PATIENCE, REST, UPSTREAM, YieldRule
+from policy.agents.yield_rule import BEHIND, BRAKING, CRAWL, EASE, HOLD, PATIENCE, REST, UPSTREAM, YieldRule
 from policy.inputs.needs import FORGET, Need, Needs
 
 ENDS = straight_road(dead_end=0)  # the right lane ends at x = 400
@@ -116,15 +116,27 @@ def test_a_vehicle_with_priority_needs_nobody() -> None:
 # ---- the rule ----
 
 
-def test_the_rule_eases_off_behind_it_until_it_has_had_its_time() -> None:
+FAR = Car("other", 380.0, 0, 15.0)  # the AV, 75 m behind its rear, can still slow down gently
+
+
+def test_the_rule_slows_down_gently_behind_it_until_it_has_had_its_time() -> None:
     rule = YieldRule()
     rule.reset(context(ENDS))
-    scene = signalling(histories(ENDS, [AV, OTHER]), other=1)
-    decision = rule.decide(scene)["av"]
-    assert decision.accel == pytest.approx(15.0 - EASE - 20.0)
-    later = {"av": scene["av"]._replace(time=HOLD + 0.1)}
+    scene = signalling(histories(ENDS, [AV, FAR]), other=1)
+    pace = math.hypot(15.0 - EASE, math.sqrt(2.0 * BRAKING * (75.0 - BEHIND)))
+    assert rule.decide(scene)["av"].accel == pytest.approx(min(pace - 20.0, EASE))
+    near = signalling(histories(ENDS, [AV, OTHER]), other=1)["av"]
+    pace = math.hypot(15.0 - EASE, math.sqrt(2.0 * BRAKING * (15.0 - BEHIND)))
+    assert rule.decide({"av": near._replace(time=1.0)})["av"].accel == pytest.approx(pace - 20.0)
+    later = {"av": near._replace(time=HOLD + 0.1)}
     assert rule.decide(later)["av"].action == MetaAction.ACCELERATE
     assert rule.decide(later)["av"].accel is None
+
+
+def test_an_av_too_near_and_too_fast_leaves_it_to_the_next() -> None:
+    rule = YieldRule()
+    rule.reset(context(ENDS))
+    assert rule.decide(signalling(histories(ENDS, [AV, OTHER]), other=1))["av"].accel is None
 
 
 def test_an_egoist_yields_to_nobody() -> None:
@@ -183,3 +195,5 @@ def test_one_av_of_a_lane_lets_a_waiting_vehicle_go() -> None:
     decisions = rule.decide({"behind": behind, "av": first})
     assert decisions["av"].accel is not None
     assert decisions["behind"].accel is None
+    alone = {"behind": behind._replace(hears=frozenset()), "av": first}
+    assert rule.decide(alone)["behind"].accel is not None, "it does not know of the other's intention"

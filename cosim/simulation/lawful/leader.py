@@ -19,6 +19,7 @@ LEADER_RANGE = 120.0  # m ahead of the AV
 VEHICLES_BEYOND_LEADER = 3  # the AV considers at most so many
 MIN_BRAKING = 1.0  # m/s2: less anticipated braking is left to the leader
 BRAKING_HORIZON = 1.0  # s for which a vehicle ahead is taken to go on braking
+SETTLING = 0.25, 0.5  # share of the headway within which the AV speeds up, and slows down, to the safe speed
 QUEUE_GAP = 2.0  # m that each vehicle in between takes up besides its length at standstill
 
 
@@ -67,7 +68,7 @@ class Leader(Rule):
         return found
 
     def _follow(self, car: Car, leader: str, gap: float) -> Limit:
-        """The safe speed, reached within half the headway, or sooner if comfortable braking is too weak."""
+        """The safe speed, reached within part of the headway, sooner if comfortable braking is too weak."""
         seen = self._eyes.view(car.name)
         if not self._eyes.ideal:
             gap -= seen.position_lag(leader, math.radians(90.0 - sumo.vehicle.getAngle(car.name)))
@@ -75,7 +76,8 @@ class Leader(Rule):
         decel = MAX_DECEL if car.evading else COMFORT_ACCEL
         lag = decel * car.headway  # m/s
         safe = math.sqrt(lag * lag + theirs * theirs + 2.0 * decel * max(gap, 0.0)) - lag
-        accel = (safe - car.speed) / max(0.5 * car.headway, self._step)
+        settling = SETTLING[safe < car.speed] * car.headway  # s
+        accel = (safe - car.speed) / max(settling, self._step)
         required = max(car.speed - theirs, 0.0) ** 2 / (2.0 * max(gap, 0.1))  # m/s2
         return Limit(max(min(accel, -required) if required > decel else accel, -MAX_DECEL), "vehicle ahead")
 

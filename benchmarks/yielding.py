@@ -27,7 +27,7 @@ RESULTS = Path("docs/results")
 PAGE, DATA = "yielding.md", "data/yielding.csv"
 RULE = "policy.agents.yield_rule"
 HABITS = {  # what the rule does, and the constant that turns it on
-    "eases off for signals": "EASES_OFF",
+    "slows down for signals": "EASES_OFF",
     "yields at lines": "YIELDS_AT_LINES",
 }
 ALONE = {f"{habit} only": constant for habit, constant in HABITS.items()}  # driver -> its only habit
@@ -143,10 +143,10 @@ def _kinds(rows: Sequence[Drive], kinds: Sequence[str]) -> Iterator[str]:
 
 WORDS = """# Is there anything to learn beyond the lawful car?
 
-The car alone is courteous where vehicles must change lanes. An agent can yield more:
-[`yield-rule`](../reference/presets.md#policies) eases off behind a vehicle that signals onto its
-lane. It also crawls, far before a line where another vehicle has waited, until that one is gone or
-has not used a clear way. No vehicle is marked.
+The car alone is courteous where vehicles must change lanes. An agent can yield more. With
+[`yield-rule`](../reference/presets.md#policies) one AV slows down gently behind a vehicle that
+signals onto its lane. One AV crawls, far before a line where another vehicle has waited. No vehicle
+is marked.
 
 {answer}
 

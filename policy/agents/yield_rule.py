@@ -26,7 +26,7 @@ HOLD, REST = 8.0, 6.0  # s of yielding in vain at most, and then without it
 
 
 class YieldRule(Idm):
-    """Accelerates, but eases off for vehicles that signal onto its lane or have long waited."""
+    """Accelerates, but slows down for vehicles that signal onto its lane or have long waited."""
 
     name = "yield-rule"
     observation = ObservationConfig(maps=False, rows=32)

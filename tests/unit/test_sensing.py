@@ -106,7 +106,7 @@ MESSAGES: dict[str, Any] = {"range": 1.0, "cam": True, "forget": 3.0}  # own sen
 
 
 def test_with_perfect_sensors_an_av_knows_everything_as_it_is() -> None:
-    cars = [EGO, Car("a", 40.0, signals=0.6), Car("b", 300.0, 0, accel=-2.0), Car("c", -80.0, 2, 31.0)]
+    cars = [EGO, Car("a", 40.0, signals=0.6), Car("b", 300.0, 0, accel=-2.0), Car("c", 80.0, 2, 31.0)]
     for truth, percepts in drive(cars, 8):
         world = percepts["ego"].world
         assert world.ids == truth.ids

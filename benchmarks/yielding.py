@@ -27,7 +27,7 @@ RESULTS = Path("docs/results")
 PAGE, DATA = "yielding.md", "data/yielding.csv"
 RULE = "policy.agents.yield_rule"
 HABITS = {  # what the rule does, and the constant that turns it on
-    "slows down for signals": "EASES_OFF",
+    "eases off for signals": "EASES_OFF",
     "yields at lines": "YIELDS_AT_LINES",
 }
 ALONE = {f"{habit} only": constant for habit, constant in HABITS.items()}  # driver -> its only habit

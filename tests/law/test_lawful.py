@@ -348,6 +348,35 @@ def test_it_follows_a_small_acceleration(start: Start) -> None:
     assert np.diff(speeds[1:]) == pytest.approx(0.3 * 0.4, abs=0.03)
 
 
+def beside_a_lane_end(start: Start, *standing: float) -> float:
+    """m that the AV is from the end of the lane that it must leave, after 20 s; inf if it has left the lane.
+    `standing`: m to that end of humans who stand beside."""
+    length, road = 114.5, '<route edges="main_acc main_out"/>'
+    humans = [
+        f'<vehicle id="h{k}" type="hv" depart="0" departLane="1" departPos="{length - away}">{road}'
+        f'<stop lane="main_acc_1" endPos="{length - away}" duration="1000"/></vehicle>'
+        for k, away in enumerate(standing)
+    ]
+    departure = 'depart="0" departLane="0" departPos="40" departSpeed="10"'
+    av = f'<vehicle id="av" type="av" {departure}>{road}</vehicle>'
+    worker = start([*humans, av], preset=Preset.LAWFUL)
+    for _ in range(50):
+        frame = worker.call("advance", [Command("av", 25.0, 0, 0.4)])[1][-1]
+    row = frame.row["av"]
+    return length - float(frame.lane_position[row]) if frame.y[row] < -7.0 else math.inf  # the lane at -8 m
+
+
+def test_before_the_end_of_its_lane_it_leaves_room_for_who_stands_further_ahead(
+    start: Start,
+) -> None:
+    queue = 0.5, 7.5, *range(20, 105, 7)
+    assert 11.0 < beside_a_lane_end(start, *queue) < 14.0
+
+
+def test_it_uses_that_room_to_get_in_front_of_who_stands_beside_it(start: Start) -> None:
+    assert beside_a_lane_end(start, 13.0) == math.inf
+
+
 def test_what_the_agent_wishes_is_comfortable_and_its_jerk_bounded() -> None:
     speed, accel, course = 25.0, 0.0, [0.0]
     for _ in range(120):

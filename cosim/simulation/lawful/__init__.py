@@ -1,4 +1,4 @@
-"""The car of preset `lawful`: the agent's wish, limited by SUMO's own driver and by six more rules.
+"""The car of preset `lawful`: the agent's wish, limited by SUMO's own driver and by seven more rules.
 
 Before every simulation step each rule limits the acceleration of the AV and names a reason. The AV drives the
 smallest limit, and an intervention is reported with its reason:
@@ -7,6 +7,7 @@ smallest limit, and an intervention is reported with its reason:
 - `driver`: SUMO's driver (speed mode 31): signals, right of way, speed limits, persons. Where its limit is
   the smallest, SUMO's driver drives by itself and may brake as hard as necessary;
 - `leader`: car following, and early braking for vehicles beyond the leader;
+- `lane end`: room for the vehicle beside the AV where a lane ends that the AV must leave;
 - `follower`: room for a human follower that does not brake;
 - `signal`: signals that have turned yellow;
 - `crossing`: stop lines at which the AV gives way;
@@ -24,6 +25,7 @@ from cosim.simulation.lawful.crossing import Crossing
 from cosim.simulation.lawful.driver import Driver
 from cosim.simulation.lawful.follower import Follower
 from cosim.simulation.lawful.inside import Inside
+from cosim.simulation.lawful.lane_end import LaneEnd
 from cosim.simulation.lawful.leader import Leader
 from cosim.simulation.lawful.signal import Signal
 from cosim.simulation.lawful.waves import Waves
@@ -57,8 +59,8 @@ class Lawful(Commander):
         # The follower rule comes first: an evasion changes the limits of the other rules.
         before_leader = self._follower, self._wish, self._driver
         leader = Leader(self._eyes, self._waves, step)
-        signal = Signal(road, step)
-        self._rules: tuple[Rule, ...] = *before_leader, leader, signal, self._crossing, self._way
+        lane_end, signal = LaneEnd(self._driver, self._eyes, step), Signal(road, step)
+        self._rules: tuple[Rule, ...] = *before_leader, leader, lane_end, signal, self._crossing, self._way
         self._last_check = -math.inf  # s, the last check of the right of way
         self._interventions: list[Intervention] = []
 

@@ -15,6 +15,7 @@ from cosim.simulation.lawful.car import LAW, Car, Limit, Rule
 from cosim.types import Preset
 
 COURTESY_PARAMETERS = "laneChangeModel.lcCooperative", "laneChangeModel.lcCooperativeSpeed"
+ROUTE_PARAMETER = "laneChangeModel.lcStrategic"  # below 0: no lane changes for the route
 MAX_REASON_DISTANCE = 150.0  # m: signals and stop lines further ahead are not named as a reason
 RESPECT_FOES = 8  # SUMO's speed mode, bit 3: respect the right of way of approaching foes
 IGNORE_INSIDE = 32  # bit 5: ignore the right of way of foes inside the junction
@@ -25,7 +26,8 @@ RESPECT_MAX_DECEL = 4  # bit 2: a commanded speed brakes within the driver's `de
 class Settings:
     """The settings of SUMO's driver in one AV."""
 
-    courtesy: dict[str, str]  # SUMO's values before the first command
+    own: dict[str, str]  # SUMO's parameters before the first command
+    changes_for_route: bool = True
     late: bool = False  # whether the driver brakes late, and then as hard as necessary
     impatience: float = 0.0
     mode: int = SPEED_MODE[Preset.LAWFUL]  # whether or not `RESPECT_MAX_DECEL` is off
@@ -46,16 +48,17 @@ class Driver(Rule):
 
     def take_control(self, name: str) -> None:
         """The AV gets its first command."""
-        own = {parameter: sumo.vehicle.getParameter(name, parameter) for parameter in COURTESY_PARAMETERS}
+        parameters = *COURTESY_PARAMETERS, ROUTE_PARAMETER
+        own = {parameter: sumo.vehicle.getParameter(name, parameter) for parameter in parameters}
         self._settings[name] = Settings(own)
         _set_driver(name, LAWFUL_TYPE)
-        for parameter in own:
+        for parameter in COURTESY_PARAMETERS:
             sumo.vehicle.setParameter(name, parameter, str(self._courtesy))
 
     def release_control(self, name: str) -> None:
         """SUMO drives the AV again, comfortably as before."""
         _set_driver(name, LAWFUL_TYPE)
-        for parameter, value in self._settings.pop(name).courtesy.items():
+        for parameter, value in self._settings.pop(name).own.items():
             sumo.vehicle.setParameter(name, parameter, value)
 
     def drop(self, name: str) -> None:
@@ -86,6 +89,13 @@ class Driver(Rule):
         if late != own.late:
             own.late = late
             _set_driver(name, LATE_TYPE if late else LAWFUL_TYPE, own.impatience)
+
+    def set_changes_for_route(self, name: str, changes: bool) -> None:
+        """Whether the driver changes lanes for the route."""
+        own = self._settings[name]
+        if changes != own.changes_for_route:
+            own.changes_for_route = changes
+            sumo.vehicle.setParameter(name, ROUTE_PARAMETER, own.own[ROUTE_PARAMETER] if changes else "-1")
 
     def set_impatience(self, name: str, impatience: float) -> None:
         """Set how hard the AV makes vehicles with priority brake; below 0: not at all."""

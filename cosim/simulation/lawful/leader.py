@@ -74,10 +74,7 @@ class Leader(Rule):
             gap -= seen.position_lag(leader, math.radians(90.0 - sumo.vehicle.getAngle(car.name)))
         theirs = seen.getSpeed(leader)
         decel = MAX_DECEL if car.evading else COMFORT_ACCEL
-        lag = decel * car.headway  # m/s
-        safe = math.sqrt(lag * lag + theirs * theirs + 2.0 * decel * max(gap, 0.0)) - lag
-        settling = SETTLING[safe < car.speed] * car.headway  # s
-        accel = (safe - car.speed) / max(settling, self._step)
+        accel = follow(car, gap, theirs, decel, self._step)
         required = max(car.speed - theirs, 0.0) ** 2 / (2.0 * max(gap, 0.1))  # m/s2
         return Limit(max(min(accel, -required) if required > decel else accel, -MAX_DECEL), "vehicle ahead")
 
@@ -90,6 +87,22 @@ class Leader(Rule):
             if closing > 0.0:
                 hardest = max(hardest, closing**2 / (2.0 * max(room, 1.0)))
         return NO_LIMIT if hardest == MIN_BRAKING else Limit(-min(hardest, COMFORT_ACCEL), "traffic ahead")
+
+
+def follow(car: Car, gap: float, theirs: float, decel: float, step: float) -> float:
+    """The acceleration (m/s2) to the safe speed behind a vehicle.
+
+    Args:
+        car: the AV.
+        gap: m to that vehicle.
+        theirs: its speed, m/s.
+        decel: m/s2, how hard both may brake.
+        step: s of a simulation step.
+    """
+    lag = decel * car.headway  # m/s
+    safe = math.sqrt(lag * lag + theirs * theirs + 2.0 * decel * max(gap, 0.0)) - lag
+    settling = SETTLING[safe < car.speed] * car.headway  # s
+    return (safe - car.speed) / max(settling, step)
 
 
 def _edges_ahead(name: str) -> set[str]:

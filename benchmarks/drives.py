@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import csv
 import importlib
+import json
 import math
 import multiprocessing
+import subprocess
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -20,26 +22,42 @@ from cosim.scenario.options import EpisodeOptions
 Row = TypeVar("Row", bound=tuple[Any, ...])
 
 
+# drives an episode with the source code in the present folder
+EPISODE = """
+import json, sys
+from cosim.batch.episode_runner import EpisodeRunner
+from cosim.scenario.options import EpisodeOptions
+
+if __name__ == "__main__":
+    options, columns = json.loads(sys.argv[1])
+    row = EpisodeRunner().run(EpisodeOptions(**options), (), None, lambda *_, **__: None)
+    print(json.dumps([row[column] for column in columns]))
+"""
+
+
 class Case(NamedTuple):
     """One requested episode."""
 
     key: tuple[Any, ...]  # the first columns of its row
     options: Mapping[str, Any]  # of `EpisodeOptions`
     constants: Mapping[str, object] = {}  # `package.module.NAME` -> its value instead of the module's
+    code: Path | None = None  # a folder with another version of this repository, which drives instead
 
 
 def drive(case: Case, columns: Sequence[str]) -> tuple[Any, ...]:
     """The episode's values of these columns. Changes constants of this process.
 
-    Raises AttributeError for a constant that its module does not have.
+    Raises AttributeError for a constant that its module does not have, ChildProcessError if other code fails.
     """
+    if case.code is not None:
+        return _drive_by_other_code(case, columns)
     for place, value in case.constants.items():
         name, _, constant = place.rpartition(".")
         module = importlib.import_module(name)
         getattr(module, constant)
         setattr(module, constant, value)
     row = EpisodeRunner().run(EpisodeOptions(**case.options), (), None, lambda *_, **__: None)
-    return tuple(math.nan if row[column] is None else row[column] for column in columns)
+    return _values(row[column] for column in columns)
 
 
 def measure(kind: type[Row], cases: Sequence[Case], workers: int, file: Path, again: bool) -> list[Row]:
@@ -83,3 +101,15 @@ def write(file: Path, columns: Iterable[str], rows: Sequence[tuple[Any, ...]]) -
     """Write the rows to a CSV file."""
     file.parent.mkdir(parents=True, exist_ok=True)
     write_csv(file, [dict(zip(columns, row, strict=True)) for row in rows])
+
+
+def _drive_by_other_code(case: Case, columns: Sequence[str]) -> tuple[Any, ...]:
+    command = [sys.executable, "-c", EPISODE, json.dumps([dict(case.options), [*columns]])]
+    found = subprocess.run(command, cwd=case.code, capture_output=True, text=True, check=False)
+    if found.returncode != 0:
+        raise ChildProcessError(f"{case.key}: {found.stderr.strip()[-400:]}")
+    return _values(json.loads(found.stdout.splitlines()[-1]))
+
+
+def _values(found: Iterable[Any]) -> tuple[Any, ...]:
+    return tuple(math.nan if value is None else value for value in found)

@@ -12,15 +12,11 @@ from __future__ import annotations
 
 import argparse
 import io
-import json
-import math
 import shutil
 import subprocess
-import sys
 import tarfile
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
@@ -40,16 +36,6 @@ COMMIT = "d1dd159"  # the last one before the car was rebuilt
 FIRST, SEEDS = 300_000, 10
 EARLIER, TODAY = CARS = ("earlier", "today")
 PER = 1000.0  # AV-km, in which collisions are counted
-EPISODE = """
-import json, sys
-from cosim.batch.episode_runner import EpisodeRunner
-from cosim.scenario.options import EpisodeOptions
-
-if __name__ == "__main__":
-    asked, columns = json.loads(sys.argv[1])
-    row = EpisodeRunner().run(EpisodeOptions(**asked), (), None, lambda *_, **__: None)
-    print(json.dumps([row[column] for column in columns]))
-"""
 
 
 class Drive(NamedTuple):
@@ -77,42 +63,15 @@ def source(commit: str, folder: Path) -> None:
     shutil.copytree(HOME / "sumo_scenarios/open", folder / "sumo_scenarios/open", dirs_exist_ok=True)
 
 
-def drive(key: tuple[str, str, int], code: Path, duration: float | None) -> Drive:
-    """One episode, by the source in the folder `code`. Raises SystemExit if it fails."""
+def case(key: tuple[str, str, int], code: Path | None, duration: float | None) -> drives.Case:
+    """The episode of a car on a road with a seed, driven by other source code if any."""
     _, road, seed = key
-    asked: dict[str, Any] = {
+    options: dict[str, Any] = {
         **{"what": f"open/{road}", "demand": "over", "policy": "car-alone", "svo_deg": 45.0},
         **{"penetration": 0.2, "behavior": "moderate", "errors": "stress", "seed": seed},
         **({} if duration is None else {"duration": duration}),
     }
-    columns = Drive._fields[KEY:]
-    command = [sys.executable, "-c", EPISODE, json.dumps([asked, columns])]
-    found = subprocess.run(command, cwd=code, capture_output=True, text=True, check=False)
-    if found.returncode != 0:
-        raise SystemExit(f"error: {key}: {found.stderr.strip()[-400:]}")
-    values = json.loads(found.stdout.splitlines()[-1])
-    return Drive(*key, *(math.nan if value is None else float(value) for value in values))
-
-
-def measure(
-    wanted: Sequence[tuple[str, str, int]],
-    code: Callable[[str], Path],
-    file: Path,
-    workers: int,
-    duration: float | None,
-    again: bool,
-) -> list[Drive]:
-    """All rows of `file`, after the missing episodes have been driven; `code`: car -> its source."""
-    rows = [] if again else drives.read(Drive, file)
-    known = {row[:KEY] for row in rows}
-    missing = [key for key in wanted if key not in known]
-    with ThreadPoolExecutor(workers) as pool:
-        running = [pool.submit(drive, key, code(key[0]), duration) for key in missing]
-        for number, done in enumerate(as_completed(running), 1):
-            rows = sorted([*rows, done.result()])
-            drives.write(file, Drive._fields, rows)
-            print(f"{file.stem} {number}/{len(missing)}: {done.result()[:KEY]}", file=sys.stderr, flush=True)
-    return rows
+    return drives.Case(key, options, code=code)
 
 
 def page(rows: Sequence[Drive], commit: str) -> list[str]:
@@ -187,8 +146,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     wanted = [(car, road, seed) for seed in args.seeds for road in args.scenario for car in CARS]
     with tempfile.TemporaryDirectory() as folder:
         source(args.commit, Path(folder))
-        code = {EARLIER: Path(folder), TODAY: HOME}
-        rows = measure(wanted, code.__getitem__, args.out / DATA, args.workers, args.duration, args.again)
+        code = {EARLIER: Path(folder), TODAY: None}
+        cases = [case(key, code[key[0]], args.duration) for key in wanted]
+        rows = drives.measure(Drive, cases, args.workers, args.out / DATA, args.again)
     write_page(args.out / PAGE, page(rows, args.commit))
     print(args.out / PAGE)
 

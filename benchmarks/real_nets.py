@@ -5,7 +5,7 @@
 
 Drives A10KW, a motorway interchange, and every other configuration that loads, with SUMO's driver in every
 AV. Measures time, memory, collisions and offences. Episodes in `--runs` (default: the page's) are not driven
-again. `--held` drives nothing. Needs `pip install cosim-sumo[tools]`.
+again. `--held` drives nothing. Needs `pip install '.[tools]'`.
 """
 
 from __future__ import annotations

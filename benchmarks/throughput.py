@@ -5,7 +5,7 @@
 
 Drives A10KW, a motorway interchange, on every seed and the other games of the eclipse-sumo package on the
 first; `--config` drives your own network instead. Rows are kept in docs/results/data/throughput.csv; the page
-is made from them. Needs `pip install cosim-sumo[tools]`.
+is made from them. Needs `pip install '.[tools]'`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ LONGEST = 900.0  # s of each drive
 NONE, CAR = "no AVs", "the lawful car"
 SHARE = 0.2
 DRIVERS: dict[str, dict[str, Any]] = {
-    NONE: {"policy": "idm", "penetration": 0.0},
+    NONE: {"policy": "idm", "penetration": 0.0, "traffic": "controlled"},  # the SUMO options of the others
     "`idm`": {"policy": "idm", "penetration": SHARE},
     "`idm-courteous`": {"policy": "idm-courteous", "penetration": SHARE},
     CAR: {"policy": "car-alone", "penetration": SHARE, "svo_deg": 45.0},
@@ -116,7 +116,8 @@ asks for more speed, at phi 45.
 
 ## Conditions
 
-The networks and their human drivers are unmodified, without driver errors. Each is driven for
+The networks and their human drivers are unmodified, without driver errors. All drives have
+[SUMO's options](../reference/formats.md#traffic-options) of controlled traffic. Each is driven for
 {longest:.0f} s at most. Sensing is `ideal`. Seeds are from 300,000. An AV is stuck if it stands for
 a minute without a reason ([figures](../reference/figures.md)). Rows:
 [{data}]({data}).

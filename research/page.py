@@ -6,7 +6,7 @@ import csv
 import itertools
 import math
 import textwrap
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from cosim.workers.tasks import OK
 from research import picture
 from research.drive import Settings
 from research.evaluate import Found, Line, traffic_of
-from research.schema import Condition
+from research.schema import Claim, Condition
 
 OUT = Path("docs/results")
 FEW = 2  # arms to compare with, so that the secondary figures are shown against each
@@ -54,7 +54,7 @@ def lines(found: Found, settings: Settings) -> list[str]:
         *(*rows, "", f"![{claim.name}]({claim.name}.svg)", ""),
         *(
             line
-            for text in filter(None, (same, claim.note, *about, command))
+            for text in filter(None, (same, arms(claim), claim.note, *about, command))
             for line in (*wrapped(text), "")
         ),
     ]
@@ -105,6 +105,17 @@ def table(found: Found) -> tuple[list[str], str]:
     shown = [[row[number] for number in kept] for row in (heads, ["---"] * len(heads), *rows)]
     about = ", ".join(f"{heads[number]} {value}" for number, value in same.items() if value != "-")
     return [f"| {' | '.join(row)} |" for row in shown], f"In all rows: {about}." if about else ""
+
+
+def arms(claim: Claim) -> str:
+    """What all arms have in common, and the options of each arm that neither the table nor its name gives."""
+    shared = {name: value for name, value in claim.options.items() if name not in COLUMNS.values()}
+    own = {
+        arm: {name: value for name, value in options.items() if str(value).partition("=")[0] != arm}
+        for arm, options in claim.every_arm.items()
+    }
+    parts = [f"All arms, unless said otherwise: {_options(shared)}."] if shared else []
+    return " ".join([*parts, *(f"`{arm}`: {_options(options)}." for arm, options in own.items() if options)])
 
 
 def conditions(found: Found, settings: Settings) -> str:
@@ -195,6 +206,10 @@ def _figure_cell(found: Found, condition: Condition, name: str) -> str:
     text = wording.interval(found.figure(condition, name, measure.name), measure, unit=False)
     published = found.claim.published.get(condition.scenario, {}).get(name)
     return text if published is None else f"{text} [{published:g}]"
+
+
+def _options(options: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name} `{value}`" for name, value in options.items())
 
 
 def _differences(found: Found, here: Sequence[Condition]) -> Iterator[list[str]]:

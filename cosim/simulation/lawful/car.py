@@ -15,6 +15,7 @@ class Limit(NamedTuple):
     reason: str = ""  # "" for the agent's own wish
 
 
+STOP_MARGIN = 0.5  # m before a stop line, or the end of a lane
 TOLERANCE = 1e-3  # m/s: SUMO's driver may be this much slower and the command still counts as driven
 LAW = "law"  # the reason of a limit that SUMO's driver drives by itself
 NO_LIMIT = Limit(math.inf)  # the output of a rule that does not apply

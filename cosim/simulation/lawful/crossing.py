@@ -12,13 +12,12 @@ from cosim.road import RoadMap
 from cosim.road.rules import RED, YELLOW
 from cosim.simulation.backend import sumo
 from cosim.simulation.eyes import Eyes
-from cosim.simulation.lawful.car import NO_LIMIT, Car, Limit, Rule
+from cosim.simulation.lawful.car import NO_LIMIT, STOP_MARGIN, Car, Limit, Rule
 from cosim.simulation.lawful.driver import Driver
 from cosim.simulation.lawful.gaps import Gaps
 from cosim.simulation.lawful.inside import Inside
 from cosim.simulation.lawful.wish import LONG_WAIT, MIN_JUNCTION_SPEED, PATIENCE
 
-STOP_MARGIN = 0.5  # m before the stop line
 DECISION_DISTANCE = 30.0  # m before the stop line, from which the AV looks for humans with priority
 APPROACH_RANGE = 100.0  # m, the length of the approaches that are searched, over any number of edges
 HEAD_OF_QUEUE = 5.0  # m to the line: a vehicle further away is queueing

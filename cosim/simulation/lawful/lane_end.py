@@ -11,14 +11,13 @@ from dataclasses import dataclass
 from cosim.control import COMFORT_ACCEL
 from cosim.simulation.backend import sumo
 from cosim.simulation.eyes import Eyes
-from cosim.simulation.lawful.car import NO_LIMIT, Car, Limit, Rule
+from cosim.simulation.lawful.car import NO_LIMIT, STOP_MARGIN, Car, Limit, Rule
 from cosim.simulation.lawful.driver import Driver
 from cosim.simulation.lawful.leader import follow
 
 ROOM = 1.7  # of the AV's length with its gap: a standing driver of SUMO changes lanes only within two
 PATIENCE = 3.0  # s of standing, after which the AV uses that room
-STANDING_SPEED = 1.0  # m/s
-STOP_MARGIN = 0.5  # m before the end of the lane
+CRAWLING_SPEED = 1.0  # m/s: a slower vehicle counts as standing
 
 
 @dataclass(slots=True)
@@ -55,7 +54,7 @@ class LaneEnd(Rule):
         wait = self._wait(car)
         if not wait.offset:
             return NO_LIMIT
-        if car.speed < STANDING_SPEED:
+        if car.speed < CRAWLING_SPEED:
             wait.standing += self._step
         goes_on = wait.standing > PATIENCE and self._is_first(car, wait.offset, length)
         self._driver.set_changes_for_route(car.name, not goes_on)
@@ -88,6 +87,6 @@ class LaneEnd(Rule):
         for other in self._eyes.known(car.name, sumo.lane.getLastStepVehicleIDs(lane)):
             there = seen.getLanePosition(other)
             beside = (here - length, "") < (there, other) < (here, car.name)
-            if beside and seen.getSpeed(other) < STANDING_SPEED:
+            if beside and seen.getSpeed(other) < CRAWLING_SPEED:
                 return True
         return False

@@ -6,9 +6,7 @@ SUMO's driver adds its headway to its braking distance, and drives on where a co
 from cosim.road import RoadMap
 from cosim.road.rules import COMFORT_DECEL, RED, YELLOW
 from cosim.simulation.backend import sumo
-from cosim.simulation.lawful.car import NO_LIMIT, Car, Limit, Rule
-
-STOP_MARGIN = 0.5  # m before the line
+from cosim.simulation.lawful.car import NO_LIMIT, STOP_MARGIN, Car, Limit, Rule
 
 
 class Signal(Rule):

@@ -148,7 +148,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         source(args.commit, Path(folder))
         code = {EARLIER: Path(folder), TODAY: None}
         cases = [case(key, code[key[0]], args.duration) for key in wanted]
-        rows = drives.measure(Drive, cases, args.workers, args.out / DATA, args.again)
+        try:
+            rows = drives.measure(Drive, cases, args.workers, args.out / DATA, args.again)
+        except ChildProcessError as error:
+            raise SystemExit(f"error: {error}") from None
     write_page(args.out / PAGE, page(rows, args.commit))
     print(args.out / PAGE)
 

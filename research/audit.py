@@ -36,9 +36,23 @@ def audit(work: Work, settings: Settings, sample: int, pick: int = 0) -> Audited
     rows = kept.episodes(settings.kept).rows
     known = [row for row in rows if row["cell"] in work.wanted]
     picked = sorted(_drawn(known, sample, pick), key=lambda row: row["key"])  # a cell's episodes in a row
-    again = _driven(picked, work, settings)
+    again = driven_again(picked, work, settings)
     differing = tuple(line for row in picked for line in _differences(row, again[row["key"]]))
     return Audited(len(picked), differing, len(rows), len(rows) - len(known))
+
+
+def driven_again(rows: list[Row], work: Work, settings: Settings) -> dict[str, dict[str, Any]]:
+    """The episodes driven again: key -> row."""
+    cells = {cell.name: cell for cell in work.cells}
+    cases = {row["key"]: cells[row["cell"]].case.with_seed(row["seed"]) for row in rows}
+    tasks = [cells[case.cell].task(case) for case in cases.values()]
+    found = {}
+    with Progress("audit", "episodes") as progress, closing(engine(settings).run(tasks)) as outcomes:
+        for outcome in outcomes:
+            case = cases[outcome.key]
+            found[outcome.key] = row_of(cells[case.cell], case, outcome)
+            progress(len(found), len(tasks))
+    return found
 
 
 # ---- inside ----
@@ -53,20 +67,6 @@ def _drawn(rows: list[Row], sample: int, pick: int) -> list[Row]:
         turns.append((met[kind], row))
         met[kind] += 1
     return [row for _, row in sorted(turns, key=lambda turn: turn[0])[:sample]]
-
-
-def _driven(rows: list[Row], work: Work, settings: Settings) -> dict[str, dict[str, Any]]:
-    """The episodes driven again: key -> row."""
-    cells = {cell.name: cell for cell in work.cells}
-    cases = {row["key"]: cells[row["cell"]].case.with_seed(row["seed"]) for row in rows}
-    tasks = [cells[case.cell].task(case) for case in cases.values()]
-    found = {}
-    with Progress("audit", "episodes") as progress, closing(engine(settings).run(tasks)) as outcomes:
-        for outcome in outcomes:
-            case = cases[outcome.key]
-            found[outcome.key] = row_of(cells[case.cell], case, outcome)
-            progress(len(found), len(tasks))
-    return found
 
 
 def _differences(row: Row, again: Row) -> Iterator[str]:

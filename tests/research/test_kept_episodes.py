@@ -19,7 +19,7 @@ def test_kept_episodes_of_car_and_scripts_are_those_of_today() -> None:
         for row in kept.episodes(settings.kept).rows
         if row["cell"] in work.wanted and row["policy"] in SCRIPTS
     }
-    again = audit._driven([*rows.values()], work, settings)
+    again = audit.driven_again([*rows.values()], work, settings)
 
     assert {*rows} == SCRIPTS
     assert [again[row["key"]]["trace_hash"] for row in rows.values()] == [

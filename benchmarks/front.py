@@ -23,10 +23,10 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from benchmarks.drives import Case, measure
-from benchmarks.full_roads import LARGEST, FullRoad, full_roads
 from benchmarks.tables import markdown_head, markdown_row, write_page
 from cosim.report.statistics import Figure as Estimate
 from cosim.report.statistics import paired_change, pooled_rate
+from sumo_scenarios.full_roads import LARGEST, FullRoad, full_roads
 from sumo_scenarios.roads import NAMED
 
 RESULTS = Path("docs/results")

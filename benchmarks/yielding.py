@@ -19,9 +19,9 @@ from textwrap import fill
 from typing import Any, NamedTuple
 
 from benchmarks.drives import Case, measure
-from benchmarks.full_roads import EACH, KINDS, LARGEST, FullRoad, full_roads
 from benchmarks.tables import markdown_head, markdown_row, write_page
 from cosim.report.statistics import Figure, paired_change
+from sumo_scenarios.full_roads import EACH, KINDS, LARGEST, FullRoad, full_roads
 
 RESULTS = Path("docs/results")
 PAGE, DATA = "yielding.md", "data/yielding.csv"

@@ -6,7 +6,7 @@ from cosim.cli import arguments
 from cosim.errors import extra
 from cosim.policies import TRAINABLE
 
-WHAT = (*TRAINABLE, "hpn", "encoder")
+WHAT = (*TRAINABLE, "altruist", "hpn", "encoder")
 VARIANTS = ("hpn", "hpn-no-history", "hpn-plain")
 
 
@@ -14,7 +14,7 @@ def add(commands: arguments.SubCommands) -> None:
     """Register the command and its flags."""
     train = commands.add_parser(
         "train",
-        help="train one of the papers' agents, or the predictor",
+        help="train one of the papers' agents, our own, or the predictor",
         description="Train a network. The folder --out then holds log.jsonl, tensorboard/, best and last "
         "weights with their configuration, and everything that --resume needs.",
     )
@@ -49,12 +49,17 @@ def add(commands: arguments.SubCommands) -> None:
 def work(args: argparse.Namespace) -> int:
     """Train until the last iteration."""
     with extra("train", field="train", value=args.what):
-        import tensorboard  # noqa: F401  # before anything is driven
+        import cma  # noqa: F401  # both before anything is driven
+        import tensorboard  # noqa: F401
     if args.what == "hpn":
         from cosim.learning import train_hpn
 
         train_hpn.check(args)
         return train_hpn.train(args)
+    if args.what == "altruist":
+        from cosim.learning import train_altruist
+
+        return train_altruist.train(args)
     if args.what == "encoder":
         from cosim.learning import train_encoder
 

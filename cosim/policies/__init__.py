@@ -46,9 +46,9 @@ def _check(text: str) -> None:
         problem = f"a policy that ships is called {name.label}: label yours otherwise"
         raise BadInput(problem, field="--policy", value=text)
     elif name.place.endswith(WEIGHTS):
-        from cosim.policies.trained import config  # torch: only when needed
+        from cosim.policies import trained  # torch: only when needed
 
-        config(Path(name.place))
+        trained.check(Path(name.place))
     else:
         name.code.load("--policy")
 

@@ -7,7 +7,8 @@ from typing import Any, TypeVar
 from cosim.errors import BadInput
 from cosim.files.yaml_input import dataclass_from
 from cosim.scenario.policy_name import PolicyName
-from cosim.types import ObservationConfig
+from cosim.types import ObservationConfig, Policy
+from policy.agents import altruist
 from policy.agents.approaches import (
     APPROACHES,
     AgentConfig,
@@ -27,12 +28,23 @@ OTHER_HPN = "trained with another HPN"
 Section = TypeVar("Section")
 
 
-def trained(name: PolicyName) -> PredictionAware:
-    """The approach at its training sizes; HPN and predictors are the shipped ones.
+def trained(name: PolicyName) -> Policy:
+    """`altruist`, or the approach at its training sizes with the shipped HPN and predictors.
 
     Raises BadInput (WeightsMismatch is one) when the card or the weights do not fit.
     """
-    return PredictionAware(name.label, config(Path(name.place)))
+    weights = Path(name.place)
+    if read_card(weights)["data"].get("policy") != altruist.NAME:
+        return PredictionAware(name.label, config(weights))
+    agent = altruist.read(weights)
+    agent.name = name.label
+    return agent
+
+
+def check(weights: Path) -> None:
+    """Raises BadInput as `trained`, for the card."""
+    if read_card(weights)["data"].get("policy") != altruist.NAME:
+        config(weights)
 
 
 def config(weights: Path) -> AgentConfig:

@@ -5,24 +5,36 @@ It is the baseline of the learned altruist: whatever learning is worth must show
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 from cosim.types import Decision, History, MetaAction, ObservationConfig, PolicyContext
 from policy.agents.idm import Idm
+from policy.inputs.conflict import along
 from policy.inputs.needs import Need, Needs
 
 # What the AV does; docs/results/yielding.md measures the effect of each
 EASES_OFF = True  # behind a vehicle that signals onto its lane
 YIELDS_AT_LINES = True  # to a vehicle that has long waited at a line where it gives way to the AV
 
-# Set by hand
-BEHIND = 10.0  # m to the rear of a vehicle that signals, where the AV has slowed down for it
-EASE = 4.0  # m/s below the speed of that vehicle
-BRAKING = 2.0  # m/s2, with which the AV slows down on the way there
-UPSTREAM = 80.0  # m before its line, where the AV begins at the latest: nearer, it would close the gap itself
-SLACK = 1.0  # m/s that the AV may be too fast when it begins
-CRAWL = 2.0  # m/s, the lowest speed of an AV that lets a vehicle go
-PATIENCE = 5.0  # s that a vehicle has waited at its line
-HOLD, REST = 8.0, 6.0  # s of yielding in vain at most, and then without it
+
+@dataclass(frozen=True, slots=True)
+class Habits:
+    """How an AV yields: those of `yield-rule` are set by hand, `cosim train altruist` searches for others."""
+
+    behind: float = 10.0  # m to the rear of a vehicle that signals, where the AV has slowed down for it
+    ease: float = 4.0  # m/s below the speed of that vehicle
+    braking: float = 2.0  # m/s2, with which the AV slows down on the way there
+    slack: float = 1.0  # m/s that the AV may be too fast when it begins
+    upstream: float = 80.0  # m before its line, where the AV begins at the latest: nearer, it closes the gap
+    crawl: float = 2.0  # m/s, the lowest speed of an AV that lets a vehicle go
+    patience: float = 5.0  # s that a vehicle has waited at its line
+    queue: float = 0.0  # share of this patience that each vehicle close behind the AV adds
+    hold: float = 8.0  # s of yielding in vain at most,
+    rest: float = 6.0  # and s without it afterwards
+
+
+HABITS = Habits()
+CLOSE = 60.0  # m behind the AV
 
 
 class YieldRule(Idm):
@@ -30,6 +42,7 @@ class YieldRule(Idm):
 
     name = "yield-rule"
     observation = ObservationConfig(maps=False, rows=32)
+    habits = HABITS
 
     def reset(self, context: PolicyContext) -> None:
         """Start an episode: nobody has yielded yet."""
@@ -44,14 +57,18 @@ class YieldRule(Idm):
         """Accelerate, or the acceleration towards the lowest speed that any need asks for."""
         needs = self._needs.find(histories) if self._weight > 0.0 else {}
         now = max((history.time for history in histories.values()), default=0.0)
-        self._began = {pair: began for pair, began in self._began.items() if now - began < HOLD + REST}
+        self._began = {
+            pair: began
+            for pair, began in self._began.items()
+            if now - began < self.habits.hold + self.habits.rest
+        }
         self._serves = self._chosen(needs, histories, now)
         return {av: self._decision(history, needs.get(av, [])) for av, history in histories.items()}
 
     def _decision(self, history: History, needs: list[Need]) -> Decision:
         speeds = [self._speed(need) for need in needs if self._yields(history, need)]
         wanted = min(speeds, default=math.inf)
-        if wanted > history.ego_speed + EASE:
+        if wanted > history.ego_speed + self.habits.ease:
             return Decision(MetaAction.ACCELERATE)
         return Decision(MetaAction.IDLE, accel=wanted - history.ego_speed)
 
@@ -76,9 +93,19 @@ class YieldRule(Idm):
 
     def _can(self, history: History, need: Need) -> bool:
         """Whether this AV is far enough away to open a gap."""
+        habits = self.habits
         if need.crossing:
-            return YIELDS_AT_LINES and need.waited >= PATIENCE and need.gap >= UPSTREAM
-        return EASES_OFF and need.gap > 0.0 and history.ego_speed <= self._speed(need) + SLACK
+            far = YIELDS_AT_LINES and need.gap >= habits.upstream
+            return far and need.waited >= self._patience(history)
+        return EASES_OFF and need.gap > 0.0 and history.ego_speed <= self._speed(need) + habits.slack
+
+    def _patience(self, history: History) -> float:
+        """s that a vehicle must have waited: the longer, the more others would wait behind this AV."""
+        own, habits = history.route.paths[1], self.habits
+        if not habits.queue or own is None:
+            return habits.patience
+        ahead = along(history, own)[:, 0]
+        return habits.patience * (1.0 + habits.queue * int(((ahead < 0.0) & (ahead > -CLOSE)).sum()))
 
     def _yields(self, history: History, need: Need) -> bool:
         """Whether the need is this AV's to serve, now, and not in vain for too long."""
@@ -89,8 +116,8 @@ class YieldRule(Idm):
         if began is None or need.between:  # nobody can use a gap before those ahead of the AV have passed
             began = now
         self._began[av, need.vehicle] = began
-        if now - began > HOLD:
-            self._rests[av] = now + REST
+        if now - began > self.habits.hold:
+            self._rests[av] = now + self.habits.rest
             del self._began[av, need.vehicle]
             return False
         return True
@@ -98,9 +125,9 @@ class YieldRule(Idm):
     def _speed(self, need: Need) -> float:
         """The speed (m/s) that a need asks for: at a line a crawl, else gently down to the other's pace."""
         if need.crossing:
-            return CRAWL
-        pace = max(need.speed - EASE * self._weight, CRAWL)
-        return math.sqrt(pace**2 + 2.0 * BRAKING * max(need.gap - BEHIND, 0.0))
+            return self.habits.crawl
+        pace = max(need.speed - self.habits.ease * self._weight, self.habits.crawl)
+        return math.sqrt(pace**2 + 2.0 * self.habits.braking * max(need.gap - self.habits.behind, 0.0))
 
 
 def _in_touch(history: History, other: str) -> bool:

@@ -25,6 +25,7 @@ OF_THE_CAR = (
     "saturated_v2v",
     "svo",
     "yielding_delay",
+    "yielding_junctions",
     "yielding_safety",
 )
 EVERYBODY = ("total_delay_s", "total_delay_av_s", "total_delay_hv_s", "longest_wait_s")

@@ -12,9 +12,12 @@ from policy_scenes import LANE_WIDTH, Car, histories, straight_road
 
 from cosim.road import Lane, Link, RoadMap, Rule
 from cosim.types import COMPACT, History, MetaAction, PolicyContext, Timing
-from policy.agents.yield_rule import BEHIND, BRAKING, CRAWL, EASE, HOLD, PATIENCE, REST, UPSTREAM, YieldRule
+from policy.agents.yield_rule import HABITS, YieldRule
 from policy.inputs.needs import FORGET, Need, Needs
 
+BEHIND, BRAKING, EASE = HABITS.behind, HABITS.braking, HABITS.ease
+CRAWL, PATIENCE, UPSTREAM = HABITS.crawl, HABITS.patience, HABITS.upstream
+HOLD, REST = HABITS.hold, HABITS.rest
 ENDS = straight_road(dead_end=0)  # the right lane ends at x = 400
 AV = Car("av", 300.0, 1, 20.0, is_av=True)
 

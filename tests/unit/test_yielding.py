@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from benchmarks import yielding
-from benchmarks.full_roads import FULL, LARGEST, FullRoad, full_roads
 from cosim.seeding import TUNING_SEEDS
 from sumo_scenarios.draw import draw
+from sumo_scenarios.full_roads import FULL, LARGEST, FullRoad, full_roads
 
 
 def test_each_habit_is_a_constant_of_the_rule_and_is_driven_alone() -> None:
@@ -48,7 +48,7 @@ def test_the_rule_is_compared_with_the_car_on_the_same_roads(delay: float, roads
 
 
 def test_the_roads_are_full_and_small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("benchmarks.full_roads.write", lambda seed, folder: folder / str(seed))
+    monkeypatch.setattr("sumo_scenarios.full_roads.write", lambda seed, folder: folder / str(seed))
     roads = [*full_roads(2, tmp_path, ("weave", "minor"))]
     assert sorted(road.kind for road in roads) == ["minor", "minor", "weave", "weave"]
     for road in roads:

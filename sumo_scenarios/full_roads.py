@@ -1,9 +1,9 @@
-"""Random validation roads that are full: what is chosen is chosen on these, never on the test roads."""
+"""Random roads that are full: what is chosen or learned is chosen on these, never on the test roads."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,10 +25,12 @@ class FullRoad(NamedTuple):
     folder: Path
 
 
-def full_roads(each: int, folder: Path, kinds: Collection[str] = KINDS) -> Iterator[FullRoad]:
-    """The first full roads of the validation seeds, `each` of these kinds, written to `folder`."""
+def full_roads(
+    each: int, folder: Path, kinds: Collection[str] = KINDS, seeds: Iterable[int] = TUNING_SEEDS
+) -> Iterator[FullRoad]:
+    """The first full roads of the seeds, `each` of these kinds, written to `folder`."""
     wanted = Counter(dict.fromkeys(kinds, each))
-    for seed in TUNING_SEEDS:
+    for seed in seeds:
         drawn = draw(seed)
         if drawn.level >= FULL and drawn.per_hour <= LARGEST and wanted[drawn.road.kind]:
             wanted[drawn.road.kind] -= 1

@@ -114,7 +114,7 @@ def train(args: argparse.Namespace) -> int:
                 for name, value in asdict(search.centre).items():
                     writer.add_scalar(f"habits/{name}", value, number)
                 writer.add_scalar("spread", search.spread, number)
-                about = {"seed": seed, "generations": number + 1, "drives": drives}
+                about = {"seed": seed, "generations": number + 1, "drives": (number + 1) * costs.size}
                 save(folder / BEST, search.centre, {"spread": search.spread}, about)
                 progress(number + 1, generations)
         print(f"{NAME}: {max(done, generations)} generations")

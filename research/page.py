@@ -43,10 +43,10 @@ def write(found: Found, settings: Settings, out: Path) -> Path:
 
 def lines(found: Found, settings: Settings) -> list[str]:
     """The page: verdict, table, picture, conditions, tests, power, command."""
-    claim, about = found.claim, (conditions(found, settings), tests(found), powered(found))
+    claim, about = found.claim, (conditions(found, settings), f"{tests(found)} {powered(found)}")
     command = (
-        f"Made by `python -m research page {claim.name}{flags(settings)}` from "
-        f"`research/claims/{claim.name}.yaml` ({claim.digest}); figures in `data/{claim.name}.csv`."
+        f"Made by `python -m research page {claim.name}{flags(settings)}` ({claim.digest}); "
+        f"figures: `data/{claim.name}.csv`."
     )
     rows, same = table(found)
     return [
@@ -114,7 +114,7 @@ def arms(claim: Claim) -> str:
         arm: {name: value for name, value in options.items() if str(value).partition("=")[0] != arm}
         for arm, options in claim.every_arm.items()
     }
-    parts = [f"All arms, unless said otherwise: {_options(shared)}."] if shared else []
+    parts = [f"All arms: {_options(shared)}."] if shared else []
     return " ".join([*parts, *(f"`{arm}`: {_options(options)}." for arm, options in own.items() if options)])
 
 
@@ -122,7 +122,10 @@ def conditions(found: Found, settings: Settings) -> str:
     """Seeds, the paper's figures, shortened and failed episodes."""
     first = min(arm.seeds.start for arm in found.arms.values())
     failed = sum(row["status"] != OK for arm in found.arms.values() for row in arm.rows)
-    parts = [f"All arms drive equal seeds from {first} on."]
+    parts = [f"Equal seeds from {first} on."]
+    if found.claim.secondary:
+        against = ", ".join(f"`{arm}`" for arm in _shown_against(found.claim))
+        parts.append(f"Last rows: `{found.claim.compare.arm}`, then its difference to {against}.")
     for option in found.claim.pool:
         values = " and ".join(str(value) for value in found.claim.matrix[option])
         parts.append(f"Episodes of {option} {values} count together.")
@@ -144,9 +147,9 @@ def tests(found: Found) -> str:
         "+"
     )
     return (
-        f"Intervals are 95 %. p is from {TESTS[claim.test]}, corrected by Holm's method "
-        f"(tests: {len(found.tested)}). The smallest effect of interest is {smallest}; the claim must hold "
-        f"{claim.holds} ([verdicts](../guides/reproduction.md#how-it-works))."
+        f"Intervals: 95 %. p: {TESTS[claim.test]}, Holm's correction (tests: {len(found.tested)}). "
+        f"Smallest effect of interest: {smallest}; must hold {claim.holds} "
+        "([verdicts](../guides/reproduction.md#how-it-works))."
     )
 
 
@@ -155,7 +158,7 @@ def powered(found: Found) -> str:
     known = [t.power for t in found.tested if not math.isnan(t.power)]
     span = f"{_span(round(100 * x) for x in known)} %" if known else "unknown"
     pairs = _span(t.found.n for t in found.tested)
-    return f"Power to find the smallest effect of interest: {span} ({pairs} pairs a test)."
+    return f"Power to find it: {span} ({pairs} pairs)."
 
 
 def flags(settings: Settings) -> str:
@@ -220,13 +223,18 @@ def _differences(found: Found, here: Sequence[Condition]) -> Iterator[list[str]]
         tested = [t for c in here for t in found.tested if (t.condition, t.against) == (c, against)]
         texts = [f"{_difference(t.found, False)}, {wording.p_value(t.p_holm)}: {t.verdict}" for t in tested]
         yield [f"difference to {against}", _span(t.found.n for t in tested), *about, *texts]
-    others = claim.compare.against if len(claim.compare.against) <= FEW else claim.compare.against[:1]
+    others = _shown_against(claim)
     for metric, against in itertools.product(claim.secondary, others):
         pairs = [found.difference(condition, against, metric) for condition in here]
         if not any(pair.n for pair in pairs):  # for example figures of AVs against an arm without any
             continue
-        name = f"{_column_head(found.measures[metric], '%')} of {claim.compare.arm}; difference to {against}"
+        name = _column_head(found.measures[metric], "%") + (f", {against}" if len(others) > 1 else "")
         yield [name, _span(p.n for p in pairs), *about, *map(_level, pairs)]
+
+
+def _shown_against(claim: Claim) -> Sequence[str]:
+    """The arms against which the secondary figures are shown."""
+    return claim.compare.against if len(claim.compare.against) <= FEW else claim.compare.against[:1]
 
 
 def _difference(one: PairedFigure, unit: bool = True) -> str:

@@ -45,7 +45,7 @@ def test_the_table_has_a_row_for_every_arm_and_difference(found: Found) -> None:
     assert rows[3].startswith("| idm | 400 | stress | - | 25.0 (21.0 to 29.5)")
     assert rows[4].startswith("| lane | 40 |")
     assert rows[5].endswith("p < 0.001: yes |")
-    assert rows[6].startswith("| dt_mean_m, m of rule; difference to idm | 400 |")
+    assert rows[6].startswith("| dt_mean_m, m | 400 |")
     assert same == "In all rows: preset unguarded, sensing ideal, drivers mixed."
 
 
@@ -54,9 +54,9 @@ def test_it_says_conditions_tests_power_and_the_command(found: Found) -> None:
     assert "A note." in text
     assert "Brackets and crosses are the paper's figures." in text
     assert "**Episodes are cut to 2 s.**" in text
-    assert "The smallest effect of interest is 10 pp; the claim must hold everywhere" in text
-    assert "Power to find the smallest effect of interest: 99 % (400 pairs a test)." in text
-    assert "`python -m research page small --scale 0.5 --duration 2` from" in text
+    assert "Smallest effect of interest: 10 pp; must hold everywhere" in text
+    assert "Power to find it: 99 % (400 pairs)." in text
+    assert "`python -m research page small --scale 0.5 --duration 2` (" in text
 
 
 @pytest.mark.parametrize("front", [(), ("dt_mean_m", "collision_rate")])

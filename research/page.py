@@ -114,7 +114,7 @@ def arms(claim: Claim) -> str:
         arm: {name: value for name, value in options.items() if str(value).partition("=")[0] != arm}
         for arm, options in claim.every_arm.items()
     }
-    parts = [f"All arms: {_options(shared)}."] if shared else []
+    parts = [f"Default: {_options(shared)}."] if shared else []
     return " ".join([*parts, *(f"`{arm}`: {_options(options)}." for arm, options in own.items() if options)])
 
 
@@ -125,7 +125,7 @@ def conditions(found: Found, settings: Settings) -> str:
     parts = [f"Equal seeds from {first} on."]
     if found.claim.secondary:
         against = ", ".join(f"`{arm}`" for arm in _shown_against(found.claim))
-        parts.append(f"Last rows: `{found.claim.compare.arm}`, then its difference to {against}.")
+        parts.append(f"Other figures: `{found.claim.compare.arm}`, then its difference to {against}.")
     for option in found.claim.pool:
         values = " and ".join(str(value) for value in found.claim.matrix[option])
         parts.append(f"Episodes of {option} {values} count together.")

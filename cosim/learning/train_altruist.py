@@ -149,10 +149,14 @@ def _driven(cases: list[EpisodeOptions], candidates: list[Habits], workers: int)
         for row, case in enumerate(cases)
         for column, habits in enumerate(candidates)
     }
-    with closing(
-        LocalEngine(Trials, workers=workers).run([task for _, _, task in tasks.values()])
-    ) as outcomes:
-        for outcome in outcomes:
+    with (
+        closing(
+            LocalEngine(Trials, workers=workers).run([task for _, _, task in tasks.values()])
+        ) as outcomes,
+        Progress("generation", "drives") as progress,
+    ):
+        for done, outcome in enumerate(outcomes, 1):
             row, column, _ = tasks[outcome.key]
             costs[row, column] = outcome.result()
+            progress(done, len(tasks))
     return costs

@@ -49,15 +49,15 @@ def add(commands: arguments.SubCommands) -> None:
 def work(args: argparse.Namespace) -> int:
     """Train until the last iteration."""
     with extra("train", field="train", value=args.what):
-        import cma  # noqa: F401  # both before anything is driven
-        import tensorboard  # noqa: F401
+        import tensorboard  # noqa: F401  # before anything is driven
     if args.what == "hpn":
         from cosim.learning import train_hpn
 
         train_hpn.check(args)
         return train_hpn.train(args)
     if args.what == "altruist":
-        from cosim.learning import train_altruist
+        with extra("train", field="train", value=args.what):
+            from cosim.learning import train_altruist
 
         return train_altruist.train(args)
     if args.what == "encoder":

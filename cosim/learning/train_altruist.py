@@ -28,10 +28,9 @@ from policy.agents.altruist import NAME, Altruist, save
 from policy.agents.yield_rule import Habits
 from policy.training.loop import tensorboard
 from policy.training.search import POPULATION, Search, mean_ranks
-from sumo_scenarios.full_roads import full_roads
+from sumo_scenarios.full_roads import KINDS, full_roads
 
 GENERATIONS = 30
-KINDS = ("lane_drop", "on_ramp", "weave", "minor", "roundabout")  # where somebody needs something of an AV
 CONTESTED = ("merge", "exit", "roundabout", "intersection")
 SHARES = (0.1, 0.2, 0.4)  # of AVs on full roads
 SVO = 45.0  # deg

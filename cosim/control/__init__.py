@@ -70,9 +70,10 @@ def tracked_speed(speed: float, target: float, step: float) -> float:
 
 
 def courtesy(svo: float) -> float:
-    """How far a lawful AV slows down for vehicles that must change lanes: 0 not at all, 1 as SUMO's drivers.
+    """The share of lawful AVs that slow down for vehicles that must change lanes, as SUMO's drivers do.
 
-    `svo`: phi in rad. The value is the weight of others, sin(phi), over the AV's own, cos(phi) (P, eq. (6)).
+    `svo`: phi in rad. The value is the weight of others, sin(phi), over the AV's own, cos(phi) (P, eq. (6)),
+    at most 1.
     """
     own, others = math.cos(svo), math.sin(svo)
     return 1.0 if others >= own and others > 0.0 else max(others / own, 0.0) if own > 0.0 else 0.0

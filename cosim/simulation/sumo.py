@@ -26,6 +26,7 @@ from cosim.scenario.sumo_outputs import sumo_options
 from cosim.scenario.sumocfg import time_of
 from cosim.scenario.traffic import CHECKS_INSIDE, FORCED, USUAL, check
 from cosim.scenario.vehicle_types import VehicleTypes, vehicle_types
+from cosim.seeding import uniform
 from cosim.sensing.perception import Perception
 from cosim.simulation.backend import sumo
 from cosim.simulation.collisions import CollisionDetector, Wrecks
@@ -82,7 +83,7 @@ class SumoSimulator:
 
     # set before the first `reset`:
     compensator: Compensator | None = None  # for sensing with latency compensation
-    courtesy: float = 1.0  # of commanded AVs in preset `lawful`: SUMO's lcCooperative, 0 to 1
+    courtesy: float = 1.0  # share of commanded AVs that are courteous in preset `lawful`, 0 to 1
     _SHARED = False  # whether other TraCI clients control the simulation too
     _FLEET: type[Fleet] = Fleet
 
@@ -131,7 +132,7 @@ class SumoSimulator:
         self._fleet = self._FLEET(self._scenario, self._drivers, self._av_parameters, self._av_types)
         preset, step = self._scenario.preset, self._scenario.timing.step
         self._commander = (
-            Lawful(step, self.road, self.courtesy) if preset == Preset.LAWFUL else Commander(preset, step)
+            Lawful(step, self.road, self._courteous) if preset == Preset.LAWFUL else Commander(preset, step)
         )
         self._commander.shared = self._SHARED
         self._bodies: dict[str, Body] = {}
@@ -335,6 +336,9 @@ class SumoSimulator:
     def _read_net(self) -> None:
         self.road = read_road(self._scenario.zones, self._scenario.config)
         self.goal_lanes, self._struggling = self._goal()
+
+    def _courteous(self, av: str) -> bool:
+        return uniform(self._seed, "courtesy", av) < self.courtesy
 
     def _load(self, seed: int) -> None:
         arguments = self._arguments(seed)

@@ -63,6 +63,24 @@ def test_it_lets_a_human_in_whose_lane_ends_if_phi_says_so(start: Start) -> None
     assert slowest(start, 1.0) > slowest(start, 0.0) + 10.0
 
 
+def test_between_0_and_1_a_share_of_the_avs_is_courteous_in_full(start: Start) -> None:
+    avs = [f"av{number}" for number in range(20)]
+    worker = start(
+        [vehicle(av, "av", 30.0 * number) for number, av in enumerate(avs)],
+        simulator=Shown,
+        preset=Preset.LAWFUL,
+    )
+    courteous = []
+    for share in (0.3, 0.6):
+        worker.call("be", share)
+        worker.call("reset", 0)
+        worker.call("advance", [Command(av, 20.0, 0, 0.4) for av in avs])
+        courteous.append({av for av in avs if worker.call("courtesy_of", av)})
+        assert all(worker.call("courtesy_of", av) == 1.0 for av in courteous[-1])
+    assert 0 < len(courteous[0]) < len(courteous[1]) < len(avs)
+    assert courteous[0] < courteous[1]
+
+
 def test_it_is_courteous_only_while_it_is_commanded(start: Start) -> None:
     worker = start([vehicle("av", "av", 0.0)], simulator=Shown, preset=Preset.LAWFUL)
     before = worker.call("courtesy_of", "av")

@@ -15,6 +15,7 @@ smallest limit, and an intervention is reported with its reason:
 """
 
 import math
+from collections.abc import Callable
 
 from cosim.road import RoadMap
 from cosim.simulation.backend import sumo
@@ -47,11 +48,11 @@ class Lawful(Commander):
 
     controlled: dict[str, Car]  # type: ignore[assignment]  # `_take_control` makes every entry
 
-    def __init__(self, step: float, road: RoadMap, courtesy: float = 1.0) -> None:
+    def __init__(self, step: float, road: RoadMap, courteous: Callable[[str], bool]) -> None:
         super().__init__(Preset.LAWFUL, step)
         fleet, self._eyes = self.controlled, Eyes(road)
         self._waves, inside = Waves(), Inside(road, self._eyes)
-        self._driver = Driver(step, courtesy)
+        self._driver = Driver(step, courteous)
         self._follower = Follower(fleet, self._driver, self._eyes, step)
         self._crossing = Crossing(fleet, self._driver, road, self._eyes, inside, step)
         self._way = Way(inside, self._waves, step)

@@ -4,6 +4,7 @@ Where SUMO's driver is slower than every other rule, it drives uncommanded and m
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from cosim.road.rules import RED, YELLOW
@@ -39,11 +40,11 @@ class Driver(Rule):
 
     Args:
         step: s of a simulation step.
-        courtesy: how far the AV slows down for vehicles that must merge, 0 to 1 (SUMO's lcCooperative).
+        courteous: whether an AV (its id) slows down for vehicles that must merge, as SUMO's drivers do.
     """
 
-    def __init__(self, step: float, courtesy: float) -> None:
-        self._step, self._courtesy = step, courtesy
+    def __init__(self, step: float, courteous: Callable[[str], bool]) -> None:
+        self._step, self._courteous = step, courteous
         self._settings: dict[str, Settings] = {}
 
     def take_control(self, name: str) -> None:
@@ -52,8 +53,10 @@ class Driver(Rule):
         own = {parameter: sumo.vehicle.getParameter(name, parameter) for parameter in parameters}
         self._settings[name] = Settings(own)
         _set_driver(name, LAWFUL_TYPE)
+        # all or nothing: a driver with half of it slows down by half of what a gap needs, and opens none
+        courtesy = str(float(self._courteous(name)))
         for parameter in COURTESY_PARAMETERS:
-            sumo.vehicle.setParameter(name, parameter, str(self._courtesy))
+            sumo.vehicle.setParameter(name, parameter, courtesy)
 
     def release_control(self, name: str) -> None:
         """SUMO drives the AV again, comfortably as before."""

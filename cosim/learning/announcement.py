@@ -1,12 +1,15 @@
 """Messages of a training before its first update: schedule, start of learning, command for the curves."""
 
+import argparse
 import math
 import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
+from pathlib import Path
 
+from cosim.errors import BadInput
 from policy.training.curriculum import Drive, DriveResult, VfnTraining
 from policy.training.vfn import Actors
 
@@ -23,6 +26,12 @@ def announce(title: str, lines: Mapping[str, str]) -> None:
 def curves(folder: str, log: str) -> str:
     """The command that shows the curves of a training in `folder`, and its file `log`."""
     return f"tensorboard --logdir {folder}  (as lines: {folder}/{log})"
+
+
+def begun(state: Path, args: argparse.Namespace) -> None:
+    """Raises BadInput if the training whose `state` is a file in --out has begun, unless it is continued."""
+    if state.exists() and not args.resume:
+        raise BadInput("holds a training run already: --resume continues it", field="--out", value=args.out)
 
 
 def begin(name: str, training: VfnTraining, wanted: int, folder: str) -> None:

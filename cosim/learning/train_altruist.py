@@ -15,7 +15,7 @@ import numpy as np
 from cosim.batch.episode_runner import EpisodeRunner
 from cosim.errors import BadInput
 from cosim.files import working_in
-from cosim.learning.announcement import announce, curves
+from cosim.learning.announcement import announce, begun, curves
 from cosim.scenario.options import EpisodeOptions
 from cosim.scenario.policy_name import BEST
 from cosim.seeding import TRAINING_SEEDS, generator
@@ -35,7 +35,6 @@ CONTESTED = ("merge", "exit", "roundabout", "intersection")
 SHARES = (0.1, 0.2, 0.4)  # of AVs on full roads
 SVO = 45.0  # deg
 WAITING = 0.3  # s of delay that 1 s2 of a squared wait costs
-UNUSED = ("reward", "metric", "errors", "scenario")  # flags of other trainings
 LOG = "log.jsonl"
 
 
@@ -76,9 +75,6 @@ def roads(seed: int, generations: int, folder: Path) -> Iterator[list[EpisodeOpt
 
 def train(args: argparse.Namespace) -> int:
     """`cosim train altruist`. Raises BadInput for invalid input before the first episode."""
-    for flag in UNUSED:
-        if getattr(args, flag):
-            raise BadInput("does not apply to altruist", field=f"--{flag}", value=getattr(args, flag))
     generations, seed = args.iterations or GENERATIONS, args.seed or 0
     drives = generations * POPULATION * (len(KINDS) + len(CONTESTED))
     announce(
@@ -91,10 +87,7 @@ def train(args: argparse.Namespace) -> int:
     )
     with working_in(args.out) as folder, tempfile.TemporaryDirectory() as scratch:
         log = folder / LOG
-        if log.exists() and not args.resume:
-            raise BadInput(
-                "holds a training run already: --resume continues it", field="--out", value=args.out
-            )
+        begun(log, args)
         search, done = _resumed(log, seed)
         with (
             closing(tensorboard(folder, done)) as writer,
@@ -116,7 +109,8 @@ def train(args: argparse.Namespace) -> int:
                 about = {"seed": seed, "generations": number + 1, "drives": (number + 1) * costs.size}
                 save(folder / BEST, search.centre, {"spread": search.spread}, about)
                 progress(number + 1, generations)
-        print(f"{NAME}: {max(done, generations)} generations")
+        driven = max(done, generations)
+        print(f"{NAME}: {driven} generation{'s' * (driven != 1)}")
         for name, value in asdict(search.centre).items():
             print(f"  {value:7.2f}  {name}")
         print(f"  {folder / BEST}")

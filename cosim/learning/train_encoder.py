@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from cosim.episode import run_episode
-from cosim.errors import BadInput
 from cosim.files import working_in
 from cosim.host import Host, Hosts
 from cosim.learning.announcement import announce, curves
@@ -119,9 +118,6 @@ def gather(agent: AgentConfig, worlds: Sequence[str], seeds: range, workers: int
 
 def train(args: argparse.Namespace) -> int:
     """`cosim train encoder`. Raises BadInput for invalid input before the first episode."""
-    for flag in ("iterations", "reward", "metric", "errors"):
-        if getattr(args, flag):
-            raise BadInput("does not apply to the encoder", field=f"--{flag}", value=getattr(args, flag))
     file = configuration(args.config).file
     training, seed, agent = file.sight, args.seed or 0, agent_config("vfn-p", file)
     worlds = [place(w) for w in args.scenario if w != "all"] or list(names())

@@ -4,7 +4,6 @@ import argparse
 import hashlib
 import json
 import shlex
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -150,12 +149,3 @@ def _manifest(keys: Sequence[tuple[Path, str]]) -> dict[str, Any]:
         "keys_sha256": hashlib.sha256(json.dumps(names).encode()).hexdigest(),
         "cells": sum(len(found.get("cells", {})) for found in folders),
     }
-
-
-def check(args: argparse.Namespace) -> None:
-    """Refuse flags that do not apply to an HPN. Raises BadInput."""
-    for flag in ("iterations", "reward", "metric", "errors"):
-        if getattr(args, flag):
-            raise BadInput("does not apply to hpn", field=f"--{flag}", value=getattr(args, flag))
-    if args.scenario:
-        print("cosim: --scenario does not apply to hpn: the recordings have the scenarios", file=sys.stderr)

@@ -12,7 +12,7 @@ import yaml
 
 from cosim.errors import BadInput
 from cosim.files import code, working_in
-from cosim.learning.announcement import Announced, begin
+from cosim.learning.announcement import Announced, begin, begun
 from cosim.learning.configuration import configuration
 from cosim.learning.rollouts import Rollouts
 from cosim.metrics import read as read_metric
@@ -46,10 +46,7 @@ def train(args: argparse.Namespace) -> int:
     for lesson in training.lessons:
         load(lesson.scenario, demand=[lesson.demand], behavior=lesson.behavior)
     with working_in(args.out) as folder:
-        if not args.resume and (folder / "state.json").exists():
-            raise BadInput(
-                "holds a training run already: --resume continues it", field="--out", value=args.out
-            )
+        begun(folder / "state.json", args)
         about = described(name, agent, file)
         about["scenarios"] = sorted({lesson.scenario for lesson in training.lessons})
         about |= {"code": own} if own else {}

@@ -71,7 +71,20 @@ def test_candidates_drive_and_what_was_found_is_a_policy(
     assert "run" in json.loads(capsys.readouterr().out)["policy"]
 
 
-def test_flags_of_other_trainings_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["train", "altruist", "--reward", "p", "--out", str(tmp_path / "run")]) == 2
-    assert "--reward='p': does not apply to altruist" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("what", "flag", "value"),
+    [
+        ("altruist", "reward", "p"),
+        ("altruist", "config", "smoke"),
+        ("altruist", "device", "cuda"),
+        ("encoder", "variant", "hpn-plain"),
+        ("hpn", "metric", "collisions"),
+        ("vfn", "variant", "hpn-plain"),
+    ],
+)
+def test_flags_of_other_trainings_are_refused(
+    what: str, flag: str, value: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["train", what, f"--{flag}", value, "--out", str(tmp_path / "run")]) == 2
+    assert f"does not apply to {what}" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()

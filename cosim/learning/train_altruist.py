@@ -33,6 +33,9 @@ from sumo_scenarios.full_roads import KINDS, full_roads
 GENERATIONS = 30
 CONTESTED = ("merge", "exit", "roundabout", "intersection")
 SHARES = (0.1, 0.2, 0.4)  # of AVs on full roads
+DURATION = (
+    400.0  # s of a drive on a full road: shows what yielding saves in a fifth of the whole drive's time
+)
 SVO = 45.0  # deg
 WAITING = 0.3  # s of delay that 1 s2 of a squared wait costs
 LOG = "log.jsonl"
@@ -63,8 +66,8 @@ def roads(seed: int, generations: int, folder: Path) -> Iterator[list[EpisodeOpt
     common: dict[str, Any] = {"policy": "yield-rule", "svo_deg": SVO, "errors": "field"}
     for road in full_roads(generations, folder, KINDS, order):
         share = SHARES[road.seed % len(SHARES)]
-        case = EpisodeOptions(str(road.folder), seed=road.seed, penetration=share, **common)
-        drawn[road.kind].append(case)
+        at = EpisodeOptions(str(road.folder), seed=road.seed, penetration=share, duration=DURATION, **common)
+        drawn[road.kind].append(at)
     for full, traffic in zip(zip(*drawn.values(), strict=True), order, strict=False):
         contested = (
             EpisodeOptions(name, seed=traffic, demand=("contested",), preset="lawful", **common)

@@ -48,7 +48,7 @@ class YieldRule(Idm):
         """Start an episode: nobody has yielded yet."""
         super().reset(context)
         self._needs = Needs(context)
-        self._weight = min(math.tan(context.svo), 1.0)  # of others, as in the lawful car's courtesy
+        self._weight = min(math.tan(context.svo), 1.0)  # of others, relative to the AV's own (P, eq. (6))
         self._began: dict[tuple[str, str], float] = {}  # (AV, vehicle) -> s, the begin of yielding
         self._rests: dict[str, float] = {}  # AV -> s, until then it does not begin to yield
         self._serves: set[tuple[str, str, int]] = set()  # AV, vehicle that it lets go, and link over its line

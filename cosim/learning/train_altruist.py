@@ -33,9 +33,7 @@ from sumo_scenarios.full_roads import KINDS, full_roads
 GENERATIONS = 30
 CONTESTED = ("merge", "exit", "roundabout", "intersection")
 SHARES = (0.1, 0.2, 0.4)  # of AVs on full roads
-DURATION = (
-    400.0  # s of a drive on a full road: shows what yielding saves in a fifth of the whole drive's time
-)
+DURATION = 400.0  # s of a full road: shows what yielding saves, in a fifth of a whole drive's time
 SVO = 45.0  # deg
 WAITING = 0.3  # s of delay that 1 s2 of a squared wait costs
 LOG = "log.jsonl"

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -15,7 +15,18 @@ import numpy as np
 from cosim.errors import BadInput, hint
 from cosim.report.compare import PairedFigure, paired
 from cosim.report.figures import Measure, Row, measures
-from cosim.report.statistics import NA, Figure, holm, mean, paired_share, power, share, signed_rank, widened
+from cosim.report.statistics import (
+    NA,
+    Figure,
+    grouped_mean,
+    holm,
+    mean,
+    paired_share,
+    power,
+    share,
+    signed_rank,
+    widened,
+)
 from cosim.types import Floats
 from cosim.workers.tasks import OK
 from research.drive import PART, Arm, Arms, policy, pooled
@@ -93,20 +104,23 @@ class Found:
 
     @property
     def overall(self) -> dict[str, PairedFigure]:
-        """Against each arm: the primary figure over the pairs of all conditions."""
+        """Against each arm: the primary figure over the pairs of all conditions.
+
+        Conditions of one scenario have the same traffic, so the interval resamples traffic, not pairs.
+        """
         claim, primary = self.claim, self.measures[self.claim.primary.metric]
         conditions = list(dict.fromkeys(condition for condition, _ in self.arms))
-        return {
-            against: paired(
-                primary,
-                [
-                    p
-                    for c in conditions
-                    for p in pairs(self.arms[c, against], self.arms[c, claim.compare.arm])
-                ],
-            )
-            for against in claim.compare.against
-        }
+        found = {}
+        for against in claim.compare.against:
+            of = {c: pairs(self.arms[c, against], self.arms[c, claim.compare.arm]) for c in conditions}
+            both = [pair for one in of.values() for pair in one]
+            traffic = [(c.scenario, _traffic(row)) for c, one in of.items() for row, _ in one]
+            found[against] = paired(primary, both)
+            if not primary.per and len({*traffic}) < len(traffic):
+                before, after = _sides(primary, both)
+                difference = grouped_mean(after - before, traffic)
+                found[against] = replace(found[against], difference=difference)
+        return found
 
     def figure(self, condition: Condition, arm: str, metric: str) -> Figure:
         """One arm's figure in one condition; NA where it applies to no episode."""
@@ -253,14 +267,15 @@ def _most(claim: Claim, one: PairedFigure, both: Sequence[tuple[Row, Row]], test
 
 
 def _verdict(claim: Claim, one: PairedFigure, most: float, p: float) -> Verdict:
-    """Yes: a significant difference in the claimed direction. No: `power.smallest` is excluded.
+    """Yes: a significant difference in the claimed direction, whose interval excludes 0 too (the test of
+    ranks is not about the mean). No: `power.smallest` is excluded.
 
     Where the other arm's share leaves no room for such an effect, only an effect the other way says no.
     """
     difference, sign = one.difference, claim.primary.sign
     if not difference.known:
         return "not resolved"
-    if p < SIGNIFICANT and sign * difference.value > 0.0:
+    if p < SIGNIFICANT and min(sign * difference.low, sign * difference.high) > 0.0:
         return "yes"
     room = math.inf
     if one.measure.is_rate:

@@ -5,7 +5,7 @@ Uses and validation: docs/explanation/statistics.md. In this module NA is nan, n
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -139,6 +139,20 @@ def mean(values: Sequence[float] | Array, seed: int = 0) -> Figure:
     `seed` fixes the resampling: equal values, equal figure.
     """
     return _bootstrap((_known(values),), np.mean, seed)
+
+
+def grouped_mean(values: Sequence[float] | Array, groups: Sequence[Hashable], seed: int = 0) -> Figure:
+    """A mean whose values come in groups that are not independent inside; nan values are left out.
+
+    `groups`: the group of each value. The bootstrap (BCa) resamples whole groups.
+    """
+    known = [(group, value) for group, value in zip(groups, values, strict=True) if not math.isnan(value)]
+    place = {group: k for k, group in enumerate(dict.fromkeys(group for group, _ in known))}
+    sums, counts = np.zeros((2, len(place)))
+    for group, value in known:
+        sums[place[group]] += value
+        counts[place[group]] += 1.0
+    return _bootstrap((sums, counts), _ratio, seed)
 
 
 def quantile(values: Sequence[float] | Array, q: float) -> Figure:
@@ -311,6 +325,10 @@ def _known(values: Sequence[float] | Array) -> Array:
 def _change(before: Array, after: Array, axis: int = -1) -> Array:
     with np.errstate(divide="ignore", invalid="ignore"):  # a resample may have only zeros
         return np.asarray(after.mean(axis=axis) / before.mean(axis=axis) - 1.0)
+
+
+def _ratio(sums: Array, counts: Array, axis: int = -1) -> Array:
+    return np.asarray(sums.sum(axis=axis) / counts.sum(axis=axis))
 
 
 def _bootstrap(samples: tuple[Array, ...], statistic: Callable[..., Any], seed: int) -> Figure:

@@ -102,16 +102,45 @@ def test_tests_are_corrected_together(tmp_path: Path) -> None:
 
 def test_a_mean_is_tested_by_signed_ranks(tmp_path: Path) -> None:
     farther = (rows([], 40, 110.0), rows([], 40, 100.0))
-    changes = {
-        "primary": {"metric": "dt_mean_m", "direction": "higher"},
-        "test": "signed_rank",
-        "power": {"smallest": 5.0, "pairs": 40},
-    }
-    one = found(tmp_path, farther, farther, **changes)
+    one = found(tmp_path, farther, farther, **MEANS)
     assert one.verdict == "yes"
     assert one.overall["idm"].difference.value == pytest.approx(10.0)
     with pytest.raises(BadInput, match="test='mcnemar': dt_mean_m is not a share of episodes"):
-        found(tmp_path, farther, farther, **{**changes, "test": "mcnemar"})
+        found(tmp_path, farther, farther, **{**MEANS, "test": "mcnemar"})
+
+
+MEANS = {
+    "primary": {"metric": "dt_mean_m", "direction": "higher"},
+    "test": "signed_rank",
+    "power": {"smallest": 5.0, "pairs": 40},
+}
+
+
+def test_ranks_alone_do_not_make_it_yes_if_the_mean_may_be_nothing(tmp_path: Path) -> None:
+    """Most episodes gain a little, two lose much."""
+    before = rows([], 40, 100.0)
+    gained = [-40.0] * 2 + [3.0] * 38
+    after = [{**row, "dt_mean_m": row["dt_mean_m"] + gain} for row, gain in zip(before, gained, strict=True)]
+    changes = {**MEANS, "power": {"smallest": 1.0, "pairs": 40}}
+    one = found(tmp_path, (after, before), (after, before), **changes).tested[0]
+    assert one.p_holm < 0.05
+    assert one.found.difference.low < 0.0 < one.found.difference.value
+    assert one.verdict == "not resolved"
+
+
+def test_the_pooled_interval_counts_traffic_once_that_two_conditions_share(tmp_path: Path) -> None:
+    before = rows([], 40, 100.0)
+    after = tuple({**row, "dt_mean_m": row["dt_mean_m"] + k % 7} for k, row in enumerate(before))
+    one = found(tmp_path, (after, before), (after, before), **MEANS)
+    both = {
+        (Condition("merge", (("errors", level),)), name): arm
+        for (_, name), arm in one.arms.items()
+        for level in ("none", "stress")
+    }
+    shared, apart = replace(one, arms=both).overall["idm"], one.overall["idm"]
+    assert shared.n == apart.n == 80
+    assert shared.difference.value == apart.difference.value
+    assert shared.difference.high > apart.difference.high
 
 
 def test_a_figure_that_the_episodes_do_not_have_is_named(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from benchmarks.behaviors import median_of_blocks
 from cosim.report.statistics import (
     Figure,
     discordant,
+    grouped_mean,
     holm,
     mcnemar,
     mean,
@@ -184,6 +185,15 @@ def test_pairing_removes_what_both_have_in_common() -> None:
 def test_a_pair_with_a_missing_side_does_not_count() -> None:
     found = paired_mean([1.0, math.nan, 3.0, 5.0], [2.0, 9.0, math.nan, 7.0])
     assert found.value == pytest.approx(1.5)
+
+
+def test_the_interval_of_a_mean_of_groups_is_that_of_the_means_of_equal_groups() -> None:
+    values = np.random.default_rng(0).normal(size=30)
+    alone, twice = mean(values), grouped_mean([*values, *values], [*range(30), *range(30)])
+    assert (twice.value, twice.low, twice.high) == pytest.approx((alone.value, alone.low, alone.high))
+    assert mean([*values, *values]).high < twice.high
+    unequal = grouped_mean([1.0, 3.0, 5.0, math.nan], ["a", "a", "b", "b"])
+    assert unequal.value == pytest.approx(3.0)
 
 
 def test_relative_change_is_of_the_means() -> None:

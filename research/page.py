@@ -74,8 +74,11 @@ def verdict(found: Found) -> str:
     ]
     counts = {word: sum(t.verdict == word for t in found.tested) for word in WORDS}
     parts = [f"{n} {word}" for word, n in counts.items() if n]
+    word = WORDS[found.verdict]
+    if found.verdict == "yes" and counts["yes"] < len(found.tested):  # of a claim that must hold somewhere
+        word = f"Yes, in {counts['yes']} of {len(found.tested)} conditions."
     return (
-        f"**{WORDS[found.verdict]}** Source: {claim.source}. "
+        f"**{word}** Source: {claim.source}. "
         f"`{claim.primary.metric}` of `{claim.compare.arm}`: "
         f"{'; '.join(effects)}. By condition: {', '.join(parts)}."
     )

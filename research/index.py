@@ -45,7 +45,7 @@ def answer(claim: Claim, out: Path) -> str:
     page = out / f"{claim.name}.md"
     text = page.read_text(encoding="utf-8") if page.is_file() else ""
     paragraphs = [" ".join(part.split()) for part in text.split("\n\n")]
-    pattern = r"\*\*([\w ]+\.)\*\* .*?: (difference to .*)\. By condition: (.*)\."
+    pattern = r"\*\*([\w, ]+\.)\*\* .*?: (difference to .*)\. By condition: (.*)\."
     found = re.match(pattern, "".join(paragraphs[1:2]))
     return f"**{found[1]}** By condition: {found[3]}; {found[2]}" if found else NOT_DRIVEN
 

@@ -76,7 +76,7 @@ def verdict(found: Found) -> str:
     parts = [f"{n} {word}" for word, n in counts.items() if n]
     word = WORDS[found.verdict]
     if found.verdict == "yes" and counts["yes"] < len(found.tested):  # of a claim that must hold somewhere
-        word = f"Yes, in {counts['yes']} of {len(found.tested)} conditions."
+        word = f"Yes, in {counts['yes']} of {len(found.tested)}."
     return (
         f"**{word}** Source: {claim.source}. "
         f"`{claim.primary.metric}` of `{claim.compare.arm}`: "

@@ -31,11 +31,12 @@ HABITS = {  # what the rule does, and the constant that turns it on
     "yields at lines": "YIELDS_AT_LINES",
 }
 ALONE = {f"{habit} only": constant for habit, constant in HABITS.items()}  # driver -> its only habit
-CAR, SHIPPED = "the car alone", "`yield-rule`"
+CAR, SHIPPED, SEARCHED = "the car alone", "`yield-rule`", "`altruist`"
 DRIVERS: dict[str, dict[str, object]] = {
     CAR: {"policy": "car-alone"},
     SHIPPED: {"policy": "yield-rule"},
     **{driver: {"policy": "yield-rule"} for driver in ALONE},
+    SEARCHED: {"policy": str(RESULTS / "trainings/altruist-0")},  # as `cosim train altruist` wrote it
     "`idm`": {"policy": "idm"},
     "`idm-courteous`": {"policy": "idm-courteous"},
     "no AVs": {"policy": "idm", "penetration": 0.0},
@@ -73,7 +74,8 @@ def case(driver: str, road: FullRoad, duration: float | None) -> Case:
 def page(rows: Sequence[Drive]) -> list[str]:
     """The answer, the drivers over all roads, then the rule by kind of road."""
     roads = Counter(kind for kind, _ in {(row.kind, row.seed) for row in rows})
-    change = _beside_car([row for row in rows if row.driver == SHIPPED], rows, "total_delay_s")
+    rule, searched = ([row for row in rows if row.driver == driver] for driver in (SHIPPED, SEARCHED))
+    change = _beside(CAR, rule, rows, "total_delay_s")
     answer = f"`yield-rule` changes everybody's delay by {_percent(change)}"
     if sum(roads.values()) < FEWEST:
         answer = f"**Not decided:** {sum(roads.values())} roads are too few. {answer}"
@@ -83,6 +85,7 @@ def page(rows: Sequence[Drive]) -> list[str]:
         answer = f"**No gain is shown.** {answer}"
     return WORDS.format(
         answer=fill(f"{answer}, against the car alone.{_costs(rows, sorted(roads))}", COLUMNS),
+        searched=fill(_searched(searched, rows), COLUMNS),
         drivers="\n".join(_drivers(rows)),
         kinds_table="\n".join(_kinds(rows, sorted(roads))),
         largest=LARGEST,
@@ -96,16 +99,28 @@ def page(rows: Sequence[Drive]) -> list[str]:
 def _costs(rows: Sequence[Drive], kinds: Sequence[str]) -> str:
     """A sentence on the kinds of road where the rule is shown to cost delay; empty without one."""
     changes = {
-        kind: _beside_car([r for r in rows if (r.driver, r.kind) == (SHIPPED, kind)], rows, "total_delay_s")
+        kind: _beside(CAR, [r for r in rows if (r.driver, r.kind) == (SHIPPED, kind)], rows, "total_delay_s")
         for kind in kinds
     }
     costs = [f"{_percent(change)} on `{kind}` roads" for kind, change in changes.items() if change.low > 0.0]
     return f" It costs {' and '.join(costs)}." if costs else ""
 
 
-def _beside_car(of: Sequence[Drive], rows: Sequence[Drive], column: str) -> Figure:
-    """The relative change of a mean against the car alone on the same roads."""
-    car = {row.seed: row for row in rows if row.driver == CAR}
+def _searched(searched: Sequence[Drive], rows: Sequence[Drive]) -> str:
+    """Whether the search has found habits that save more delay than the rule's."""
+    change = _beside(SHIPPED, searched, rows, "total_delay_s")
+    if not change.known:
+        return "`altruist` has not been driven."
+    found = "better ones" if change.high < 0.0 else "no better ones"
+    return (
+        f"[A search](../guides/training.md#search-for-an-altruist) over the rule's habits found {found}: "
+        f"`altruist` changes everybody's delay by {_percent(change)}, against `yield-rule`."
+    )
+
+
+def _beside(other: str, of: Sequence[Drive], rows: Sequence[Drive], column: str) -> Figure:
+    """The relative change of a mean against another driver on the same roads."""
+    car = {row.seed: row for row in rows if row.driver == other}
     pairs = [(car[row.seed], row) for row in of if row.seed in car]
     before, after = ([getattr(pair[k], column) for pair in pairs] for k in (0, 1))
     return paired_change(before, after)
@@ -124,7 +139,7 @@ def _drivers(rows: Sequence[Drive]) -> Iterator[str]:
         if not of:
             continue
         columns = () if driver == CAR else ("total_delay_s", "total_delay_hv_s")
-        change = [_percent(_beside_car(of, rows, column)) for column in columns] or ["", ""]
+        change = [_percent(_beside(CAR, of, rows, column)) for column in columns] or ["", ""]
         hard = "" if driver == "no AVs" else f"{fmean(row.hard_brakings_av for row in of):.0f}"
         hits = "" if driver == "no AVs" else f"{sum(row.av_involved_collisions for row in of):.0f}"
         delay = f"{fmean(row.total_delay_s for row in of):.1f}"
@@ -137,7 +152,7 @@ def _kinds(rows: Sequence[Drive], kinds: Sequence[str]) -> Iterator[str]:
     for kind in kinds:
         car, rule = ([r for r in rows if (r.driver, r.kind) == (d, kind)] for d in (CAR, SHIPPED))
         delays = [f"{fmean(r.total_delay_s for r in of):.1f} s" if of else "" for of in (car, rule)]
-        change = _percent(_beside_car(rule, rows, "total_delay_s"))
+        change = _percent(_beside(CAR, rule, rows, "total_delay_s"))
         yield markdown_row([f"`{kind}`", str(len(rule)), *delays, change])
 
 
@@ -149,6 +164,8 @@ signals onto its lane. One AV crawls, far before a line where another vehicle ha
 is marked.
 
 {answer}
+
+{searched}
 
 ## Everybody's mean delay
 

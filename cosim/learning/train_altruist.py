@@ -100,7 +100,7 @@ def train(args: argparse.Namespace) -> int:
                 candidates = search.ask()
                 costs = _driven(cases, candidates, args.workers)
                 search.tell(ranks := mean_ranks(costs))
-                line = {"seed": seed, "generation": number, "ranks": ranks, "costs": costs.tolist()}
+                line = {"seed": seed, "generation": number, "ranks": ranks, "costs": costs.round(2).tolist()}
                 line |= {"centre": asdict(search.centre), "spread": search.spread}
                 with log.open("a", encoding="utf-8") as file:
                     file.write(json.dumps(line) + "\n")

@@ -47,6 +47,17 @@ def test_the_rule_is_compared_with_the_car_on_the_same_roads(delay: float, roads
     assert f"| `weave` | {roads} | 100.0 s | {100 * delay:.1f} s | {100 * delay - 100:.0f}" in text
 
 
+def test_what_a_search_found_is_compared_with_the_rule() -> None:
+    driven = [*rows(yielding.CAR, 1e-3, 24), *rows("`yield-rule`", 0.8e-3, 24)]
+    assert "`altruist` has not been driven." in "\n".join(yielding.page(driven))
+    for delay, found in (
+        (0.6, "found better ones: `altruist` changes everybody's delay by -25"),
+        (0.9, "no better ones"),
+    ):
+        text = " ".join(yielding.page([*driven, *rows("`altruist`", delay / 1e3, 24)]))
+        assert found in text
+
+
 def test_the_roads_are_full_and_small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("sumo_scenarios.full_roads.write", lambda seed, folder: folder / str(seed))
     roads = [*full_roads(2, tmp_path, ("weave", "minor"))]

@@ -72,7 +72,9 @@ def case(driver: str, road: FullRoad, duration: float | None) -> Case:
 
 
 def page(rows: Sequence[Drive]) -> list[str]:
-    """The answer, the drivers over all roads, then the rule by kind of road."""
+    """The answer, the drivers over all roads that each has driven, then the rule by kind of road."""
+    driven = Counter(row.seed for row in rows)
+    rows = [row for row in rows if driven[row.seed] == max(driven.values())]
     roads = Counter(kind for kind, _ in {(row.kind, row.seed) for row in rows})
     rule, searched = ([row for row in rows if row.driver == driver] for driver in (SHIPPED, SEARCHED))
     change = _beside(CAR, rule, rows, "total_delay_s")
@@ -160,8 +162,7 @@ WORDS = """# Is there anything to learn beyond the lawful car?
 
 The car alone is courteous where vehicles must change lanes. An agent can yield more. With
 [`yield-rule`](../reference/presets.md#policies) one AV slows down gently behind a vehicle that
-signals onto its lane. One AV crawls, far before a line where another vehicle has waited. No vehicle
-is marked.
+signals onto its lane. One AV crawls, far before a line where another vehicle has waited.
 
 {answer}
 

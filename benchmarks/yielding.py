@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
 from textwrap import fill
@@ -92,10 +92,16 @@ def page(rows: Sequence[Drive]) -> list[str]:
         kinds_table="\n".join(_kinds(rows, sorted(roads))),
         largest=LARGEST,
         roads=", ".join(f"{count} {kind}" for kind, count in sorted(roads.items())),
-        each=max(roads.values(), default=EACH),
-        kinds=" ".join(sorted(roads)),
+        commands="\n".join(_commands(roads)),
         data=DATA,
     ).splitlines()
+
+
+def _commands(roads: Mapping[str, int]) -> Iterator[str]:
+    """What drives these numbers of roads of each kind."""
+    for each in sorted({*roads.values()}):
+        kinds = sorted(kind for kind, count in roads.items() if count == each)
+        yield f"python -m benchmarks.yielding --each {each} --kinds {' '.join(kinds)}"
 
 
 def _costs(rows: Sequence[Drive], kinds: Sequence[str]) -> str:
@@ -160,7 +166,7 @@ def _kinds(rows: Sequence[Drive], kinds: Sequence[str]) -> Iterator[str]:
 
 WORDS = """# Is there anything to learn beyond the lawful car?
 
-The car alone is courteous where vehicles must change lanes. An agent can yield more. With
+The car alone is courteous where vehicles must change lanes. With
 [`yield-rule`](../reference/presets.md#policies) one AV slows down gently behind a vehicle that
 signals onto its lane. One AV crawls, far before a line where another vehicle has waited.
 
@@ -173,8 +179,8 @@ signals onto its lane. One AV crawls, far before a line where another vehicle ha
 {drivers}
 
 Changes are relative to the car alone; brackets hold 95 % intervals over roads. Three more habits
-were tried, and none is shown to save delay: making way to another lane, arriving no faster than the
-traffic ahead, and overtaking.
+are not shown to save delay: making way to another lane, arriving no faster than the traffic ahead,
+overtaking.
 
 ## By kind of road
 
@@ -188,7 +194,7 @@ Random roads of the validation seeds whose demand is at least their nominal capa
 [{data}]({data}).
 
 ```
-python -m benchmarks.yielding --each {each} --kinds {kinds}
+{commands}
 ```
 """
 

@@ -74,7 +74,8 @@ def case(driver: str, road: FullRoad, duration: float | None) -> Case:
 def page(rows: Sequence[Drive]) -> list[str]:
     """The answer, the drivers over all roads that each has driven, then the rule by kind of road."""
     driven = Counter(row.seed for row in rows)
-    rows = [row for row in rows if driven[row.seed] == max(driven.values())]
+    most = max(driven.values(), default=0)
+    rows = [row for row in rows if driven[row.seed] == most]
     roads = Counter(kind for kind, _ in {(row.kind, row.seed) for row in rows})
     rule, searched = ([row for row in rows if row.driver == driver] for driver in (SHIPPED, SEARCHED))
     change = _beside(CAR, rule, rows, "total_delay_s")
@@ -128,8 +129,8 @@ def _searched(searched: Sequence[Drive], rows: Sequence[Drive]) -> str:
 
 def _beside(other: str, of: Sequence[Drive], rows: Sequence[Drive], column: str) -> Figure:
     """The relative change of a mean against another driver on the same roads."""
-    car = {row.seed: row for row in rows if row.driver == other}
-    pairs = [(car[row.seed], row) for row in of if row.seed in car]
+    others = {row.seed: row for row in rows if row.driver == other}
+    pairs = [(others[row.seed], row) for row in of if row.seed in others]
     before, after = ([getattr(pair[k], column) for pair in pairs] for k in (0, 1))
     return paired_change(before, after)
 

@@ -180,6 +180,12 @@ def yielding(place: Place) -> list[list[str]]:
     return [["benchmarks.yielding", *few, "--out", str(place.out)]]
 
 
+def yielding_window(place: Place) -> list[list[str]]:
+    """What 100 s of yielding bring, in copies of one simulation."""
+    few = ["--each", "1", "--kinds", "weave"] if place.small else []
+    return [["benchmarks.yielding_window", *few, "--out", str(place.out)]]
+
+
 def throughput(place: Place) -> list[list[str]]:
     """Arrivals with and without AVs in networks of other authors."""
     few = ["--nets", "corridor", "--seeds", "300000:300001", "--duration", "30"] if place.small else []
@@ -197,6 +203,7 @@ PAGES = (
     Page("front", front, ("front.md", "front.svg", "data/front.csv")),
     Page("earlier_car", earlier_car, ("earlier_car.md", "data/earlier_car.csv")),
     Page("yielding", yielding, ("yielding.md", "data/yielding.csv")),
+    Page("yielding_window", yielding_window, ("yielding_window.md", "data/yielding_window.csv")),
     Page("law", law, ("law.md",)),
     Page("agent", agent, ("agent.md",)),
     Page("prediction_speed", prediction_speed, ("prediction_speed.md",)),

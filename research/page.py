@@ -125,10 +125,10 @@ def conditions(found: Found, settings: Settings) -> str:
     """Seeds, the paper's figures, shortened and failed episodes."""
     first = min(arm.seeds.start for arm in found.arms.values())
     failed = sum(row["status"] != OK for arm in found.arms.values() for row in arm.rows)
-    parts = [f"Equal seeds from {first} on."]
+    parts = [f"Seeds from {first} on."]
     if found.claim.secondary:
         against = ", ".join(f"`{arm}`" for arm in _shown_against(found.claim))
-        parts.append(f"Other figures: `{found.claim.compare.arm}`, then its difference to {against}.")
+        parts.append(f"Other figures: `{found.claim.compare.arm}`; difference to {against}.")
     for option in found.claim.pool:
         values = " and ".join(str(value) for value in found.claim.matrix[option])
         parts.append(f"Episodes of {option} {values} count together.")
@@ -150,8 +150,8 @@ def tests(found: Found) -> str:
         "+"
     )
     return (
-        f"Intervals: 95 %. p: {TESTS[claim.test]}, Holm's correction (tests: {len(found.tested)}). "
-        f"Smallest effect of interest: {smallest}; must hold {claim.holds} "
+        f"95 % intervals. p: {TESTS[claim.test]}, Holm's correction ({len(found.tested)} tests). "
+        f"Smallest effect of interest: {smallest}, {claim.holds} "
         "([verdicts](../guides/reproduction.md#how-it-works))."
     )
 
@@ -161,7 +161,7 @@ def powered(found: Found) -> str:
     known = [t.power for t in found.tested if not math.isnan(t.power)]
     span = f"{_span(round(100 * x) for x in known)} %" if known else "unknown"
     pairs = _span(t.found.n for t in found.tested)
-    return f"Power to find it: {span} ({pairs} pairs)."
+    return f"Power: {span} ({pairs} pairs)."
 
 
 def flags(settings: Settings) -> str:

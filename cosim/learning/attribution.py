@@ -39,6 +39,10 @@ HEAD = (
     "| input | replacement | decisions | choices changed | best valued changed | mean abs dq | spread |",
     "|---|---|---:|---:|---:|---:|---:|",
 )
+HEAD_OF_ALL = (
+    "| policy | inputs that never change a choice | largest share of choices that a replacement changes |",
+    "|---|---|---|",
+)
 METHOD = """\
 The agent drives as in `cosim run`. At every decision the same network is evaluated again with one input
 replaced: "zeroed"; "as at present", by the newest perceived frame instead of the others; or "another AV's",
@@ -263,7 +267,7 @@ def markdown(
     driven: Sequence[Mapping[str, Any]], tables: Mapping[str, Sequence[Mapping[str, Any]]], command: str
 ) -> str:
     """The tables as a document; inputs without effect come first."""
-    page = ["# Which inputs the value networks use", ""]
+    page = ["# Which inputs the value networks use", "", *HEAD_OF_ALL]
     for policy, rows in tables.items():
         largest = {
             name: max(row["choices_changed"] for row in mine)
@@ -271,8 +275,7 @@ def markdown(
         }
         never = ", ".join(name for name, x in largest.items() if x == 0.0) or "none"
         some = [f"{name} {100 * x:.2g} %" for name, x in sorted(largest.items(), key=itemgetter(1)) if x]
-        page += [f"- `{policy}`: inputs that change no choice, with any replacement: {never}."]
-        page += [f"  Largest share of the choices that a replacement changes: {', '.join(some) or '0 %'}."]
+        page.append(f"| `{policy}` | {never} | {', '.join(some) or '0 %'} |")
     e = driven[0]
     drivers = (
         f"HVs {e['behavior']} ({e['driver_model']}), errors `{e['errors'] or 'none'}`, "

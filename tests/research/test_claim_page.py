@@ -54,8 +54,8 @@ def test_it_says_conditions_tests_power_and_the_command(found: Found) -> None:
     assert "A note." in text
     assert "Brackets and crosses are the paper's figures." in text
     assert "**Episodes are cut to 2 s.**" in text
-    assert "Smallest effect of interest: 10 pp; must hold everywhere" in text
-    assert "Power to find it: 99 % (400 pairs)." in text
+    assert "Smallest effect of interest: 10 pp, everywhere" in text
+    assert "Power: 99 % (400 pairs)." in text
     assert "`python -m research page small --scale 0.5 --duration 2` (" in text
 
 

@@ -56,7 +56,8 @@ def test_the_command_writes_table_page_and_picture(
     assert len({(row["input"], row["replacement"]) for row in rows}) == len(rows) == 11
     text = (tmp_path / "attribution.md").read_text()
     assert text in capsys.readouterr().out
-    assert text.startswith("# Which inputs the value networks use\n\n- `vfn`: inputs that change no choice")
+    assert text.startswith("# Which inputs the value networks use\n\n| policy |")
+    assert "\n| `vfn` | " in text
     assert "preset `lawful`" in text
     assert "2 episodes a policy" in text
     assert (tmp_path / "attribution.png").stat().st_size > 1000

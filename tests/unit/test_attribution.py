@@ -195,15 +195,14 @@ def test_shares_are_those_of_the_decisions_of_all_episodes_and_the_page_says_wha
     assert rows[2]["choices_changed_low"] < 0.3 < rows[2]["choices_changed_high"]
     assert (rows[2]["unmasked_changed_count"], rows[2]["mean_abs_dq"], rows[2]["spread"]) == (8, 0.2, 0.5)
     page = markdown(episodes, {"x": rows}, "cosim bench attribution ...")
-    assert "`x`: inputs that change no choice, with any replacement: maps." in page
-    assert "phi 30 %" in page
+    assert "| `x` | maps | phi 30 % |" in page
     assert "2 episodes a policy" in page
     answers[0].pop(("maps", "another AV's"))  # it comes in the last episode only, after another input
     late = np.array([8.0, 8.0, 8.0, 1.0, 4.0])
     episodes[1]["answers"] = {keys[0]: np.array(sums[0]), keys[2]: np.array(sums[2]), keys[1]: late}
     rows = table(episodes)
     assert [(row["input"], row["decisions"]) for row in rows] == [("maps", 20), ("maps", 8), ("phi", 20)]
-    assert "with any replacement: none." in markdown(episodes, {"x": rows}, "cosim bench attribution ...")
+    assert "| `x` | none | " in markdown(episodes, {"x": rows}, "cosim bench attribution ...")
 
 
 def test_a_mask_of_another_clock_is_refused() -> None:

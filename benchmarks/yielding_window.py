@@ -1,0 +1,245 @@
+"""What do 100 s of yielding bring? Exact copies of one simulation differ in these 100 s alone.
+
+    python -m benchmarks.yielding_window [--each N] [--kinds KIND ...] [--workers N] [--again]
+                                         [--out docs/results]
+
+At four times of a drive on a full random validation road the process is copied (`cosim.simulation.fork`).
+In each copy AVs follow one habit of `yield-rule` for 100 s, or none; then the car alone drives on. Rows are
+kept in docs/results/data/yielding_window.csv.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+from textwrap import fill
+from typing import NamedTuple, get_type_hints
+
+from benchmarks.drives import read, write
+from benchmarks.tables import markdown_head, markdown_row, write_page
+from cosim.batch.episode_runner import EpisodeRunner
+from cosim.episode import Episode, Hook, Step
+from cosim.report.statistics import Figure, grouped_mean
+from cosim.scenario.options import EpisodeOptions
+from cosim.simulation.fork import forked
+from cosim.types import Decision, History, Policy
+from policy.agents import yield_rule
+from sumo_scenarios.full_roads import EACH, full_roads
+
+RESULTS = Path("docs/results")
+PAGE, DATA = "yielding_window.md", "data/yielding_window.csv"
+KINDS = ("lane_drop", "on_ramp", "weave", "minor", "roundabout")  # an arterial's AVs do not yield
+OF_HABIT = {"eases off for signals": "EASES_OFF", "yields at lines": "YIELDS_AT_LINES"}
+NEVER = "never yields"
+BRANCHES = (NEVER, *OF_HABIT)
+TIMES = (100.0, 200.0, 300.0, 400.0)  # s, when the copies part
+WINDOW = 100.0  # s
+AFTER = (100, 200, 400)  # s from its beginning, when the delay is read
+COLUMNS = 100  # of the page
+
+
+class Branch(NamedTuple):
+    """A row of the CSV: one copy. Delays are sums over all vehicles due so far."""
+
+    kind: str  # of road
+    seed: int  # of the road and of its traffic
+    time: float  # s, when the copies parted
+    branch: str  # of `BRANCHES`
+    yieldings: int  # begun in the window
+    after_100_s: float  # s of delay of everybody together
+    after_200_s: float
+    after_400_s: float
+
+
+class Counted(yield_rule.YieldRule):
+    """`yield-rule`, which counts how often an AV has begun to let a vehicle go."""
+
+    def __init__(self) -> None:
+        self.served: frozenset[tuple[str, str, int]] = frozenset()
+
+    def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
+        """As `YieldRule` does."""
+        decisions = super().decide(histories)
+        self.served = self.served | self._serves
+        return decisions
+
+
+class Windows(Hook):
+    """Copies the simulation at each of `TIMES`, and drives on in the copies."""
+
+    def __init__(self, policy: Counted, kind: str) -> None:
+        self.policy, self.kind = policy, kind
+        self.rows: list[Branch] = []
+        self._times = [*TIMES]
+
+    def on_step(self, episode: Episode, step: Step) -> None:
+        """Drive every branch, if it is time."""
+        if self._times and episode.elapsed >= self._times[0]:
+            time = self._times.pop(0)
+            for branch in BRANCHES:
+                self.rows.append(forked(partial(self._drive_on, episode, time, branch)))
+
+    def _drive_on(self, episode: Episode, time: float, branch: str) -> Branch:
+        """In a copy of the process: count yieldings in the window, then the sums of delay."""
+        self._times, began = [], episode.elapsed
+        _yield(branch)
+        self.policy.served = frozenset()
+        yieldings, delays = 0, []
+        for after in AFTER:
+            while episode.elapsed < began + after:
+                episode.advance(self.policy.decide(episode.histories))
+            if after == WINDOW:
+                yieldings = len(self.policy.served)
+                _yield(NEVER)
+            figures = episode.result(self.policy.name).metrics
+            due, mean = (figures[name].value or 0.0 for name in ("vehicles_due", "total_delay_s"))
+            delays.append(round(due * mean, 1))
+        return Branch(self.kind, episode.seed, time, branch, yieldings, *delays)
+
+
+def _yield(branch: str) -> None:
+    """Turn on the habit of this branch alone."""
+    for habit, constant in OF_HABIT.items():
+        setattr(yield_rule, constant, habit == branch)
+
+
+class _Runner(EpisodeRunner):
+    def __init__(self, policy: Policy) -> None:
+        super().__init__()
+        self._policy = policy
+
+    def policy(self, case: EpisodeOptions) -> str | Policy:
+        return self._policy
+
+
+def drive(folder: str, kind: str, seed: int) -> list[Branch]:
+    """All copies of one drive; changes constants of this process."""
+    _yield(NEVER)
+    policy = Counted()
+    windows = Windows(policy, kind)
+    case = EpisodeOptions(
+        folder,
+        seed=seed,
+        policy=policy.name,
+        duration=TIMES[-1] + AFTER[-1] + 1.0,
+        penetration=0.2,
+        behavior="moderate",
+        errors="field",
+        svo_deg=45.0,
+    )
+    with closing(_Runner(policy)) as runner:
+        runner.open(case, ()).run(seed, hooks=[windows])
+    return windows.rows
+
+
+# ---- the page ----
+
+
+def page(rows: Sequence[Branch]) -> list[str]:
+    """The change by each habit, by kind of road."""
+    kinds = {row.kind: None for row in rows}
+    return WORDS.format(
+        answer=fill(" ".join(_answers(rows)), COLUMNS),
+        table="\n".join(_table(rows, [*kinds])),
+        roads=", ".join(f"{len({r.seed for r in rows if r.kind == kind})} {kind}" for kind in kinds),
+        data=DATA,
+    ).splitlines()
+
+
+def _answers(rows: Sequence[Branch]) -> Iterator[str]:
+    for habit in OF_HABIT:
+        change, long = (_changes(rows, habit)[k] for k in (1, 2))
+        yield (
+            f"An AV that {habit} changes the delay of all vehicles together by {change.text(0)} s a window "
+            f"after {AFTER[1]} s, and by {long.text(0)} s after {AFTER[2]} s."
+        )
+
+
+def _changes(rows: Sequence[Branch], habit: str) -> list[Figure]:
+    """At each of `AFTER`: the change of the sum of delay against the copy that never yields, s a window.
+
+    Only windows in which an AV has yielded.
+    """
+    never = {(row.seed, row.time): row for row in rows if row.branch == NEVER}
+    of = [row for row in rows if row.branch == habit and row.yieldings]
+    roads = [row.seed for row in of]
+    return [
+        grouped_mean([getattr(row, name) - getattr(never[row.seed, row.time], name) for row in of], roads)
+        for name in (f"after_{after}_s" for after in AFTER)
+    ]
+
+
+def _table(rows: Sequence[Branch], kinds: Sequence[str]) -> Iterator[str]:
+    yield from markdown_head(["", "", "windows", "yieldings in each", *(f"after {a} s" for a in AFTER)])
+    for habit in OF_HABIT:
+        for kind in kinds:
+            of = [row for row in rows if row.kind == kind]
+            yielded = [row.yieldings for row in of if row.branch == habit and row.yieldings]
+            if yielded:
+                changes = [change.text(0) for change in _changes(of, habit)]
+                each = f"{sum(yielded) / len(yielded):.0f}"
+                yield markdown_row([habit, f"`{kind}`", str(len(yielded)), each, *changes])
+
+
+WORDS = """# What do 100 s of yielding bring?
+
+Copies of one simulation differ in 100 s alone, in which AVs follow one habit of
+[`yield-rule`](yielding.md), or never yield. Afterwards the car alone drives. No vehicle, error or
+random number differs before.
+
+{answer}
+
+## Change of the sum of all vehicles' delay, s a window
+
+{table}
+
+Brackets hold 95 % intervals over roads. Windows without a yielding are left out.
+
+## Conditions
+
+Random roads of the validation seeds, as in [yielding](yielding.md): {roads}. Four windows a drive,
+from 100, 200, 300 and 400 s on. 20 % AVs, errors `field`, phi 45. Rows: [{data}]({data}).
+
+```
+python -m benchmarks.yielding_window
+```
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Drive what is missing, keep, write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--each", type=int, default=2 * EACH, metavar="N", help="roads of a kind")
+    parser.add_argument("--kinds", nargs="*", default=KINDS, choices=KINDS, metavar="KIND")
+    parser.add_argument("--workers", type=int, default=2, metavar="N")
+    parser.add_argument("--again", action="store_true", help="also what is measured")
+    parser.add_argument("--out", type=Path, default=RESULTS, metavar="FOLDER")
+    args = parser.parse_args(arguments)
+    rows = [] if args.again else read(Branch, args.out / DATA)
+    spawn = multiprocessing.get_context("spawn")
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        ProcessPoolExecutor(args.workers, spawn, max_tasks_per_child=1) as pool,
+    ):
+        known = {row.seed for row in rows}
+        roads = [r for r in full_roads(args.each, Path(folder), args.kinds) if r.seed not in known]
+        running = [pool.submit(drive, str(road.folder), road.kind, road.seed) for road in roads]
+        for number, done in enumerate(as_completed(running), 1):
+            rows = sorted([*rows, *done.result()], key=lambda row: (KINDS.index(row.kind), row.seed))
+            write(args.out / DATA, get_type_hints(Branch), rows)
+            print(f"yielding_window {number}/{len(roads)}", file=sys.stderr, flush=True)
+    write_page(args.out / PAGE, page(rows))
+    print(args.out / PAGE)
+
+
+if __name__ == "__main__":
+    main()

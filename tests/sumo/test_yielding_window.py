@@ -1,0 +1,53 @@
+"""Windows of yielding: a copy that never yields is what happens, one that yields differs; the page counts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks import yielding_window
+from benchmarks.yielding_window import NEVER, Branch, Counted, Windows, drive, page
+from cosim.episode import Episode, Step
+from sumo_scenarios.draw import write
+
+ROAD = 100_243  # a full minor road
+
+
+def test_a_copy_that_never_yields_is_what_happens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(yielding_window, "TIMES", (100.0,))
+    monkeypatch.setattr(yielding_window, "WINDOW", 40.0)
+    monkeypatch.setattr(yielding_window, "AFTER", (40, 50, 60))
+    happened: list[float] = []
+
+    class Watched(Windows):
+        def __init__(self, policy: Counted, kind: str) -> None:
+            super().__init__(policy, kind)
+            self._times = [*yielding_window.TIMES]
+
+        def on_step(self, episode: Episode, step: Step) -> None:
+            super().on_step(episode, step)
+            if self.rows and episode.elapsed in (140.0, 150.0, 160.0):
+                figures = episode.result("").metrics
+                total = (figures["vehicles_due"].value or 0.0) * (figures["total_delay_s"].value or 0.0)
+                happened.append(round(total, 1))
+
+    monkeypatch.setattr(yielding_window, "Windows", Watched)
+    never, eases, lines = drive(str(write(ROAD, tmp_path)), "minor", ROAD)
+    assert [row.branch for row in (never, eases, lines)] == list(yielding_window.BRANCHES)
+    assert [never.after_100_s, never.after_200_s, never.after_400_s] == happened
+    assert never.yieldings == 0 < lines.yieldings
+    assert lines.after_400_s != never.after_400_s
+
+
+def test_the_page_leaves_out_windows_without_a_yielding() -> None:
+    rows = [
+        Branch("weave", seed, time, branch, served, 100.0, 200.0, 400.0 - served)
+        for seed in (1, 2, 3)
+        for time, served in ((100.0, 10), (200.0, 0))
+        for branch, served in ((NEVER, 0), ("eases off for signals", served), ("yields at lines", 0))
+    ]
+    text = "\n".join(page(rows))
+    assert "| eases off for signals | `weave` | 3 | 10 | 0 (0 to 0) | 0 (0 to 0) | -10 (-10 to -10) |" in text
+    assert "yields at lines | `weave`" not in text
+    assert "3 weave" in text

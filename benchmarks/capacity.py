@@ -38,6 +38,7 @@ from sumo_scenarios import road_folders
 from sumo_scenarios.roads import NAMED, Minor, Section
 
 RESULTS = Path("docs/results")
+DPI = 100.0  # of the points, which are no vectors
 PAGE, PICTURE, DATA = "capacity.md", "capacity.svg", "data/capacity.csv"
 RISING, OVER = "rising", "over"
 # range of the rising demand, vehicles/h per lane at the bottleneck
@@ -281,14 +282,15 @@ def picture(rows: Sequence[Minute], file: Path) -> None:
         for demand, mark in ((RISING, "o"), (OVER, "x")):
             of = [row for row in rows if (row.road, row.demand) == (name, demand) and row.minute > 1]
             density = [row.density_per_km_lane for row in of]
-            axes.plot(density, [row.flow_per_h for row in of], mark, markersize=2.5, label=demand)
+            flow = [row.flow_per_h for row in of]
+            axes.plot(density, flow, mark, markersize=2.5, label=demand, rasterized=True)
         axes.set_title(f"open/{name}", fontsize=9)
         axes.set_ylim(bottom=0.0)
     figure.supxlabel("density before the bottleneck, vehicles/km and lane")
     figure.supylabel("flow, vehicles/h")
     figure.axes[0].legend(fontsize=7)
     with rc_context({"svg.hashsalt": "capacity", "svg.fonttype": "none"}):
-        figure.savefig(file, metadata={"Date": None})
+        figure.savefig(file, dpi=DPI, metadata={"Date": None})
 
 
 COLUMNS = (

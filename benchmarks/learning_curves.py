@@ -27,9 +27,9 @@ from cosim.errors import BadInput, CosimError
 from cosim.learning.picture import save
 from cosim.types import Floats
 
-COURSES = {"crashed": "crashed, %", "mission_success": "missions fulfilled, %", "dt_mean_m": "distance, m"}
+COURSES = {"crashed": "crashed, %", "mission_success": "missions, %", "dt_mean_m": "distance, m"}
 PERCENT = ("crashed", "mission_success")
-PARTS = {"train": "training drives", "valid": "validation, greedy"}
+PARTS = {"train": "training", "valid": "validation"}
 WINDOW = 20  # iterations, averaging window of training drives
 
 

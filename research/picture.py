@@ -21,6 +21,7 @@ from research.schema import Condition
 TICKS = (0.0, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # %
 STYLE: Any = {"svg.fonttype": "none", "svg.hashsalt": "cosim", "font.size": 9.0}  # equal figures, equal file
 CLIP = re.compile(r"\bp[0-9a-f]{10}\b")  # hash of a clip's exact size, whose last bits depend on the machine
+FINE = re.compile(r"\b\d+\.\d{3,}\b")  # a coordinate, in hundredths of a point and finer
 
 
 def draw(found: Found, path: Path) -> None:
@@ -35,6 +36,7 @@ def save(picture: Picture, path: Path) -> None:
         picture.savefig(drawn, format="svg", metadata={"Date": None, "Creator": None})
     numbers: dict[str, str] = {}
     text = CLIP.sub(lambda found: numbers.setdefault(found[0], f"clip{len(numbers)}"), drawn.getvalue())
+    text = FINE.sub(lambda found: f"{float(found[0]):.2f}", text)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text, encoding="utf-8")
 

@@ -14,6 +14,7 @@ import argparse
 import multiprocessing
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import closing
@@ -144,22 +145,24 @@ def drive(folder: str, kind: str, seed: int) -> list[Branch]:
 
 def page(rows: Sequence[Branch]) -> list[str]:
     """The change by each habit, by kind of road."""
-    kinds = {row.kind: None for row in rows}
     return WORDS.format(
         answer=fill(" ".join(_answers(rows)), COLUMNS),
-        table="\n".join(_table(rows, [*kinds])),
-        roads=", ".join(f"{len({r.seed for r in rows if r.kind == kind})} {kind}" for kind in kinds),
-        data=DATA,
+        table="\n".join(_table(rows)),
+        conditions=fill(CONDITIONS.format(roads=_roads(rows), data=DATA), COLUMNS),
     ).splitlines()
+
+
+def _roads(rows: Sequence[Branch]) -> str:
+    counts = Counter(kind for kind, _ in {(row.kind, row.seed) for row in rows})
+    return ", ".join(f"{counts[kind]} {kind}" for kind in KINDS if counts[kind])
 
 
 def _answers(rows: Sequence[Branch]) -> Iterator[str]:
     for habit in OF_HABIT:
-        change, long = (_changes(rows, habit)[k] for k in (1, 2))
-        yield (
-            f"An AV that {habit} changes the delay of all vehicles together by {change.text(0)} s a window "
-            f"after {AFTER[1]} s, and by {long.text(0)} s after {AFTER[2]} s."
-        )
+        at = [
+            f"{change.text(0)} s after {a} s" for change, a in zip(_changes(rows, habit), AFTER, strict=True)
+        ]
+        yield f"An AV that {habit}: {', '.join(at)}."
 
 
 def _changes(rows: Sequence[Branch], habit: str) -> list[Figure]:
@@ -176,10 +179,10 @@ def _changes(rows: Sequence[Branch], habit: str) -> list[Figure]:
     ]
 
 
-def _table(rows: Sequence[Branch], kinds: Sequence[str]) -> Iterator[str]:
+def _table(rows: Sequence[Branch]) -> Iterator[str]:
     yield from markdown_head(["", "", "windows", "yieldings in each", *(f"after {a} s" for a in AFTER)])
     for habit in OF_HABIT:
-        for kind in kinds:
+        for kind in KINDS:
             of = [row for row in rows if row.kind == kind]
             yielded = [row.yieldings for row in of if row.branch == habit and row.yieldings]
             if yielded:
@@ -188,24 +191,25 @@ def _table(rows: Sequence[Branch], kinds: Sequence[str]) -> Iterator[str]:
                 yield markdown_row([habit, f"`{kind}`", str(len(yielded)), each, *changes])
 
 
+CONDITIONS = (
+    "Random full roads of the validation seeds: {roads}. Windows begin at 100, 200, 300 and 400 s. 20 % AVs, "
+    "errors `field`, phi 45. Rows: [{data}]({data})."
+)
 WORDS = """# What do 100 s of yielding bring?
 
-Copies of one simulation differ in 100 s alone, in which AVs follow one habit of
-[`yield-rule`](yielding.md), or never yield. Afterwards the car alone drives. No vehicle, error or
-random number differs before.
+Exact copies of one simulation differ in 100 s alone. In these, AVs follow one habit of
+[`yield-rule`](yielding.md) or never yield; before and afterwards the car drives alone. Change of
+the sum of all vehicles' delay, a window:
 
 {answer}
 
-## Change of the sum of all vehicles' delay, s a window
+## By kind of road
 
 {table}
 
 Brackets hold 95 % intervals over roads. Windows without a yielding are left out.
 
-## Conditions
-
-Random roads of the validation seeds, as in [yielding](yielding.md): {roads}. Four windows a drive,
-from 100, 200, 300 and 400 s on. 20 % AVs, errors `field`, phi 45. Rows: [{data}]({data}).
+{conditions}
 
 ```
 python -m benchmarks.yielding_window

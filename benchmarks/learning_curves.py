@@ -22,7 +22,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Picture
 
-from benchmarks.tables import markdown_row, write_page
+from benchmarks.tables import markdown_head, markdown_row, write_page
 from cosim.errors import BadInput, CosimError
 from cosim.learning.picture import save
 from cosim.types import Floats
@@ -101,22 +101,26 @@ def page(runs: Sequence[Training], command: str, drawn: str = "") -> list[str]:
     lines += [
         f"Training drives explore; their values are means over {WINDOW} iterations. Validation is greedy, on",
         "validation seeds. Thin lines are single training seeds, thick lines are their mean. The table has",
-        "the mean over training seeds, and in brackets the lowest and the highest value.",
+        "the first and the last mean over training seeds, in brackets the lowest and the highest value.",
         "",
         *([f"![crashes, missions, distance over training]({drawn})", ""] if drawn else []),
-        markdown_row(["agent", "seeds", "iterations", "drives", "figure", "first", "last"]),
-        "|---" * 7 + "|",
+        *markdown_head(["agent", "seeds", "iterations", "drives", *COURSES.values()]),
     ]
     for label, mine in _by_label(runs).items():
         seeds = ", ".join("?" if run.seed is None else str(run.seed) for run in mine)
         count = ", ".join(dict.fromkeys(str(run.iterations) for run in mine))
-        for (part, name), courses in _shared(mine).items():
-            _, mean, low, high = together(courses)
-            if not len(mean):
-                continue
-            ends = [_text(name, mean[k], low[k], high[k]) for k in (0, -1)]
-            lines.append(markdown_row([label, seeds, count, PARTS[part], COURSES[name], *ends]))
+        courses = _shared(mine)
+        for part, drives in PARTS.items():
+            cells = [_ends(name, courses.get((part, name), ())) for name in COURSES]
+            if any(cells):
+                lines.append(markdown_row([label, seeds, count, drives, *cells]))
     return lines
+
+
+def _ends(name: str, courses: Sequence[Course]) -> str:
+    """The first and the last value over the seeds; empty without any."""
+    mean, low, high = together(courses)[1:] if courses else ((),) * 3
+    return "; ".join(_text(name, mean[k], low[k], high[k]) for k in (0, -1)) if len(mean) else ""
 
 
 def shown(name: str, value: float) -> str:

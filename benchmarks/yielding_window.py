@@ -182,13 +182,15 @@ def _changes(rows: Sequence[Branch], habit: str) -> list[Figure]:
 def _table(rows: Sequence[Branch]) -> Iterator[str]:
     yield from markdown_head(["", "", "windows", "yieldings in each", *(f"after {a} s" for a in AFTER)])
     for habit in OF_HABIT:
+        name = habit  # in its first row only
         for kind in KINDS:
             of = [row for row in rows if row.kind == kind]
             yielded = [row.yieldings for row in of if row.branch == habit and row.yieldings]
             if yielded:
                 changes = [change.text(0) for change in _changes(of, habit)]
                 each = f"{sum(yielded) / len(yielded):.0f}"
-                yield markdown_row([habit, f"`{kind}`", str(len(yielded)), each, *changes])
+                yield markdown_row([name, f"`{kind}`", str(len(yielded)), each, *changes])
+                name = ""
 
 
 CONDITIONS = (

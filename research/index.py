@@ -27,14 +27,15 @@ Both simulate with HighwayEnv, we with SUMO; scenarios and demands are ours. Eve
 
 
 def write(claims: Sequence[Claim], out: Path) -> Path:
-    """README.md of the results: a line for every claim, then every page."""
+    """README.md of the results: a line for every claim, then the other pages."""
     text = INDEX
     for claim in claims:
         page = out / f"{claim.name}.md"
         there = f"[{claim.name}]({page.name})" if page.is_file() else ""
         text += f"| {claim.sentence} | {claim.source} | {claim.holds} | {answer(claim, out)} | {there} |\n"
-    others = sorted(p.name for p in out.glob("*.md") if p.name != "README.md")
-    text += "\nAll pages: " + ", ".join(f"[{name.removesuffix('.md')}]({name})" for name in others) + ".\n"
+    shown = {"README.md", *(f"{claim.name}.md" for claim in claims)}
+    others = sorted(p.name for p in out.glob("*.md") if p.name not in shown)
+    text += "\nOther pages: " + ", ".join(f"[{name.removesuffix('.md')}]({name})" for name in others) + ".\n"
     with whole(out / "README.md") as draft:
         draft.write_text(text, encoding="utf-8")
     return out / "README.md"

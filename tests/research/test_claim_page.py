@@ -82,13 +82,14 @@ def test_the_index_has_a_line_for_every_claim_and_says_what_is_not_driven(
 ) -> None:
     other = replace(found.claim, name="other", sentence="Nobody drove this")
     page.write(found, Settings(), tmp_path)
+    (tmp_path / "law.md").touch()
     text = index.write([found.claim, other], tmp_path).read_text()
     assert (
         f"| {SMALL['sentence']} | ours | everywhere | **Yes.** By condition: 2 yes; "
         "difference to `idm` -25.0 pp (-28.1 to -22.1), 800 pairs | [small](small.md) |" in text
     )
     assert "| Nobody drove this | ours | everywhere | Not driven yet. |  |" in text
-    assert "All pages: [small](small.md)." in text
+    assert "Other pages: [law](law.md)." in text
 
 
 def test_a_page_of_other_weights_files_or_definition_is_found(found: Found, tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from typing import NamedTuple, get_type_hints
 from benchmarks.drives import read, write
 from benchmarks.tables import markdown_head, markdown_row, write_page
 from cosim.batch.episode_runner import EpisodeRunner
-from cosim.episode import Episode, Hook, Step
+from cosim.episode import Episode, Hook, Step, drive_on
 from cosim.report.statistics import Figure, grouped_mean
 from cosim.scenario.options import EpisodeOptions
 from cosim.simulation.fork import forked
@@ -94,8 +94,7 @@ class Windows(Hook):
         self.policy.served = frozenset()
         yieldings, delays = 0, []
         for after in AFTER:
-            while episode.elapsed < began + after:
-                episode.advance(self.policy.decide(episode.histories))
+            drive_on(episode, self.policy, began + after)
             if after == WINDOW:
                 yieldings = len(self.policy.served)
                 _yield(NEVER)

@@ -352,15 +352,22 @@ def run_episode(
     """Drive one whole episode with one policy; `svo` (phi) in rad."""
     began, compiled = clock(), compilation_time()
     policy.reset(episode.context(seed, svo))
-    histories = episode.start(seed, hooks)
-    while not episode.over:
-        before, observed = clock(), episode.timings["observation_s"]
-        decisions = policy.decide(histories)
-        observed -= episode.timings["observation_s"]
-        episode.timings["decision_s"] += clock() - before + observed
-        histories = episode.advance(decisions)
-        if progress is not None:
-            progress(episode.elapsed, episode.scenario.duration)
+    episode.start(seed, hooks)
+    drive_on(episode, policy, progress=progress)
     episode.timings["compilation_s"] = compilation_time() - compiled
     episode.timings["total_s"] = clock() - began + episode.timings["compilation_s"]
     return episode.result(policy.name, policy.label, svo)
+
+
+def drive_on(
+    episode: Episode, policy: Policy, until: float = math.inf, progress: Progress | None = None
+) -> None:
+    """The loop: continue a started episode to its end, or to `until` s of counted time."""
+    while not episode.over and episode.elapsed < until:
+        before, observed = clock(), episode.timings["observation_s"]
+        decisions = policy.decide(episode.histories)
+        observed -= episode.timings["observation_s"]
+        episode.timings["decision_s"] += clock() - before + observed
+        episode.advance(decisions)
+        if progress is not None:
+            progress(episode.elapsed, episode.scenario.duration)

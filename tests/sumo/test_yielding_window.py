@@ -9,6 +9,7 @@ import pytest
 from benchmarks import yielding_window
 from benchmarks.yielding_window import NEVER, Branch, Counted, Windows, drive, page
 from cosim.episode import Episode, Step
+from policy.agents import yield_rule
 from sumo_scenarios.draw import write
 
 ROAD = 100_243  # a full minor road
@@ -18,6 +19,8 @@ def test_a_copy_that_never_yields_is_what_happens(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(yielding_window, "TIMES", (100.0,))
     monkeypatch.setattr(yielding_window, "WINDOW", 40.0)
     monkeypatch.setattr(yielding_window, "AFTER", (40, 50, 60))
+    for constant in yielding_window.OF_HABIT.values():
+        monkeypatch.setattr(yield_rule, constant, False)  # `drive` changes it; restored after this test
     happened: list[float] = []
 
     class Watched(Windows):

@@ -11,6 +11,7 @@ kept in docs/results/data/yielding_window.csv.
 from __future__ import annotations
 
 import argparse
+import math
 import multiprocessing
 import sys
 import tempfile
@@ -25,25 +26,22 @@ from typing import NamedTuple, get_type_hints
 
 from benchmarks.drives import read, write
 from benchmarks.tables import markdown_head, markdown_row, write_page
-from cosim.batch.episode_runner import EpisodeRunner
+from benchmarks.yielding import COLUMNS, HABITS, RESULTS, SHIPPED, case
 from cosim.episode import Episode, Hook, Step, drive_on
+from cosim.host import Host
 from cosim.report.statistics import Figure, grouped_mean
 from cosim.scenario.options import EpisodeOptions
 from cosim.simulation.fork import forked
-from cosim.types import Decision, History, Policy
+from cosim.types import Decision, History
 from policy.agents import yield_rule
-from sumo_scenarios.full_roads import EACH, full_roads
+from sumo_scenarios.full_roads import EACH, FullRoad, full_roads
 
-RESULTS = Path("docs/results")
 PAGE, DATA = "yielding_window.md", "data/yielding_window.csv"
 KINDS = ("lane_drop", "on_ramp", "weave", "minor", "roundabout")  # an arterial's AVs do not yield
-OF_HABIT = {"eases off for signals": "EASES_OFF", "yields at lines": "YIELDS_AT_LINES"}
 NEVER = "never yields"
-BRANCHES = (NEVER, *OF_HABIT)
+BRANCHES = (NEVER, *HABITS)
 TIMES = (100.0, 200.0, 300.0, 400.0)  # s, when the copies part
-WINDOW = 100.0  # s
-AFTER = (100, 200, 400)  # s from its beginning, when the delay is read
-COLUMNS = 100  # of the page
+AFTER = (100, 200, 400)  # s later, when the delay is read; the window ends at the first
 
 
 class Branch(NamedTuple):
@@ -95,47 +93,29 @@ class Windows(Hook):
         yieldings, delays = 0, []
         for after in AFTER:
             drive_on(episode, self.policy, began + after)
-            if after == WINDOW:
+            if after == AFTER[0]:
                 yieldings = len(self.policy.served)
                 _yield(NEVER)
             figures = episode.result(self.policy.name).metrics
-            due, mean = (figures[name].value or 0.0 for name in ("vehicles_due", "total_delay_s"))
-            delays.append(round(due * mean, 1))
+            due, mean = (figures[name].value for name in ("vehicles_due", "total_delay_s"))
+            delays.append(math.nan if due is None or mean is None else round(due * mean, 1))
         return Branch(self.kind, episode.seed, time, branch, yieldings, *delays)
 
 
 def _yield(branch: str) -> None:
     """Turn on the habit of this branch alone."""
-    for habit, constant in OF_HABIT.items():
+    for habit, constant in HABITS.items():
         setattr(yield_rule, constant, habit == branch)
 
 
-class _Runner(EpisodeRunner):
-    def __init__(self, policy: Policy) -> None:
-        super().__init__()
-        self._policy = policy
-
-    def policy(self, case: EpisodeOptions) -> str | Policy:
-        return self._policy
-
-
-def drive(folder: str, kind: str, seed: int) -> list[Branch]:
+def drive(road: FullRoad) -> list[Branch]:
     """All copies of one drive; changes constants of this process."""
     _yield(NEVER)
     policy = Counted()
-    windows = Windows(policy, kind)
-    case = EpisodeOptions(
-        folder,
-        seed=seed,
-        policy=policy.name,
-        duration=TIMES[-1] + AFTER[-1] + 1.0,
-        penetration=0.2,
-        behavior="moderate",
-        errors="field",
-        svo_deg=45.0,
-    )
-    with closing(_Runner(policy)) as runner:
-        runner.open(case, ()).run(seed, hooks=[windows])
+    windows = Windows(policy, road.kind)
+    options = EpisodeOptions(**case(SHIPPED, road, TIMES[-1] + AFTER[-1] + 1.0).options)
+    with closing(Host(options.scenario(), policy, math.radians(options.svo_deg))) as host:
+        host.run(road.seed, hooks=[windows])
     return windows.rows
 
 
@@ -157,11 +137,11 @@ def _roads(rows: Sequence[Branch]) -> str:
 
 
 def _answers(rows: Sequence[Branch]) -> Iterator[str]:
-    for habit in OF_HABIT:
-        at = [
-            f"{change.text(0)} s after {a} s" for change, a in zip(_changes(rows, habit), AFTER, strict=True)
-        ]
-        yield f"An AV that {habit}: {', '.join(at)}."
+    for habit in HABITS:
+        windows = sum(row.branch == habit and row.yieldings > 0 for row in rows)
+        changes = zip(_changes(rows, habit), AFTER, strict=True)
+        at = [f"{change.text(0)} s after {after} s" for change, after in changes]
+        yield f"An AV that {habit} ({windows} windows): {', '.join(at)}."
 
 
 def _changes(rows: Sequence[Branch], habit: str) -> list[Figure]:
@@ -180,7 +160,7 @@ def _changes(rows: Sequence[Branch], habit: str) -> list[Figure]:
 
 def _table(rows: Sequence[Branch]) -> Iterator[str]:
     yield from markdown_head(["", "", "windows", "yieldings in each", *(f"after {a} s" for a in AFTER)])
-    for habit in OF_HABIT:
+    for habit in HABITS:
         name = habit  # in its first row only
         for kind in KINDS:
             of = [row for row in rows if row.kind == kind]
@@ -194,7 +174,7 @@ def _table(rows: Sequence[Branch]) -> Iterator[str]:
 
 CONDITIONS = (
     "Random full roads of the validation seeds: {roads}. Windows begin at 100, 200, 300 and 400 s. 20 % AVs, "
-    "errors `field`, phi 45. Rows: [{data}]({data})."
+    "preset `lawful`, drivers `moderate`, errors `field`, sensing `ideal`, phi 45. Rows: [{data}]({data})."
 )
 WORDS = """# What do 100 s of yielding bring?
 
@@ -237,7 +217,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     ):
         known = {row.seed for row in rows}
         roads = [r for r in full_roads(args.each, Path(folder), args.kinds) if r.seed not in known]
-        running = [pool.submit(drive, str(road.folder), road.kind, road.seed) for road in roads]
+        running = [pool.submit(drive, road) for road in roads]
         for number, done in enumerate(as_completed(running), 1):
             rows = sorted([*rows, *done.result()], key=lambda row: (KINDS.index(row.kind), row.seed))
             write(args.out / DATA, get_type_hints(Branch), rows)

@@ -11,15 +11,15 @@ from benchmarks.yielding_window import NEVER, Branch, Counted, Windows, drive, p
 from cosim.episode import Episode, Step
 from policy.agents import yield_rule
 from sumo_scenarios.draw import write
+from sumo_scenarios.full_roads import FullRoad
 
 ROAD = 100_243  # a full minor road
 
 
 def test_a_copy_that_never_yields_is_what_happens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(yielding_window, "TIMES", (100.0,))
-    monkeypatch.setattr(yielding_window, "WINDOW", 40.0)
     monkeypatch.setattr(yielding_window, "AFTER", (40, 50, 60))
-    for constant in yielding_window.OF_HABIT.values():
+    for constant in yielding_window.HABITS.values():
         monkeypatch.setattr(yield_rule, constant, False)  # `drive` changes it; restored after this test
     happened: list[float] = []
 
@@ -36,7 +36,7 @@ def test_a_copy_that_never_yields_is_what_happens(tmp_path: Path, monkeypatch: p
                 happened.append(round(total, 1))
 
     monkeypatch.setattr(yielding_window, "Windows", Watched)
-    never, eases, lines = drive(str(write(ROAD, tmp_path)), "minor", ROAD)
+    never, eases, lines = drive(FullRoad(ROAD, "minor", write(ROAD, tmp_path)))
     assert [row.branch for row in (never, eases, lines)] == list(yielding_window.BRANCHES)
     assert [never.after_100_s, never.after_200_s, never.after_400_s] == happened
     assert never.yieldings == 0 < lines.yieldings

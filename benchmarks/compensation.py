@@ -35,7 +35,9 @@ from cosim.types import Compensator, Kind, Preset, Snapshot, Timing, Tracks
 SCENARIOS = ("merge", "roundabout", "intersection")
 POLICY = "altruist-rule"
 DELAYS = (0.4, 0.8, 1.6)  # s
-COMPENSATIONS: tuple[Any, ...] = get_args(get_type_hints(Parameters)["compensation"])
+COMPENSATIONS: tuple[Any, ...] = tuple(
+    how for how in get_args(get_type_hints(Parameters)["compensation"]) if how != "truth"
+)
 LATE = "{delay:g} s late"
 SKIPPED = 20  # frames, until the AV's histories are full
 EVERY = 5  # frames, once a second

@@ -4,8 +4,8 @@
                                          [--out docs/results]
 
 At four times of a drive on a full random validation road the process is copied (`cosim.simulation.fork`).
-In each copy AVs follow one habit of `yield-rule` for 100 s, or none; then the car alone drives on. Rows are
-kept in docs/results/data/yielding_window.csv.
+In each copy AVs follow one habit of `yield-rule` for 100 s, or none, or one for vehicles that need it of
+another AV; then the car alone drives on. Rows are kept in docs/results/data/yielding_window.csv.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import math
 import multiprocessing
+import random
 import sys
 import tempfile
 from collections import Counter
@@ -32,14 +33,20 @@ from cosim.host import Host
 from cosim.report.statistics import Figure, grouped_mean
 from cosim.scenario.options import EpisodeOptions
 from cosim.simulation.fork import forked
-from cosim.types import Decision, History
+from cosim.types import Decision, History, PolicyContext
 from policy.agents import yield_rule
+from policy.inputs.needs import Need, Needs
 from sumo_scenarios.full_roads import EACH, FullRoad, full_roads
 
 PAGE, DATA = "yielding_window.md", "data/yielding_window.csv"
 KINDS = ("lane_drop", "on_ramp", "weave", "minor", "roundabout")  # an arterial's AVs do not yield
-NEVER = "never yields"
-BRANCHES = (NEVER, *HABITS)
+NEVER, EXCHANGED = "never yields", "eases off as another AV should"
+BRANCHES: dict[str, tuple[str, bool]] = {  # the constant that is on, and whether AVs exchange their needs
+    NEVER: ("", False),
+    **{habit: (constant, False) for habit, constant in HABITS.items()},
+    EXCHANGED: ("EASES_OFF", True),
+}
+YIELDING = tuple(branch for branch in BRANCHES if branch != NEVER)
 TIMES = (100.0, 200.0, 300.0, 400.0)  # s, when the copies part
 AFTER = (100, 200, 400)  # s later, when the delay is read; the window ends at the first
 
@@ -57,10 +64,27 @@ class Branch(NamedTuple):
     after_400_s: float
 
 
+class Exchanged(Needs):
+    """Needs; if `on`, each AV gets those of another one: as many, of vehicles that it cannot help."""
+
+    on = False
+
+    def find(self, histories: Mapping[str, History]) -> dict[str, list[Need]]:
+        """See `Needs`."""
+        needs = super().find(histories)
+        if not self.on:
+            return needs
+        drawn = sorted(histories, key=lambda av: random.Random(av).random())  # neighbours have like names
+        return {av: needs.get(other, []) for av, other in zip(drawn, drawn[1:] + drawn[:1], strict=True)}
+
+
 class Counted(yield_rule.YieldRule):
     """`yield-rule`, which counts how often an AV has begun to let a vehicle go."""
 
-    def __init__(self) -> None:
+    def reset(self, context: PolicyContext) -> None:
+        """As `YieldRule` does."""
+        super().reset(context)
+        self._needs = Exchanged(context)
         self.served: frozenset[tuple[str, str, int]] = frozenset()
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
@@ -73,8 +97,8 @@ class Counted(yield_rule.YieldRule):
 class Windows(Hook):
     """Copies the simulation at each of `TIMES`, and drives on in the copies."""
 
-    def __init__(self, policy: Counted, kind: str) -> None:
-        self.policy, self.kind = policy, kind
+    def __init__(self, policy: Counted, kind: str, branches: Sequence[str] = tuple(BRANCHES)) -> None:
+        self.policy, self.kind, self.branches = policy, kind, branches
         self.rows: list[Branch] = []
         self._times = [*TIMES]
 
@@ -82,7 +106,7 @@ class Windows(Hook):
         """Drive every branch, if it is time."""
         if self._times and episode.elapsed >= self._times[0]:
             time = self._times.pop(0)
-            for branch in BRANCHES:
+            for branch in self.branches:
                 self.rows.append(forked(partial(self._drive_on, episode, time, branch)))
 
     def _drive_on(self, episode: Episode, time: float, branch: str) -> Branch:
@@ -104,19 +128,24 @@ class Windows(Hook):
 
 def _yield(branch: str) -> None:
     """Turn on the habit of this branch alone."""
-    for habit, constant in HABITS.items():
-        setattr(yield_rule, constant, habit == branch)
+    on, Exchanged.on = BRANCHES[branch]
+    for constant in HABITS.values():
+        setattr(yield_rule, constant, constant == on)
 
 
-def drive(road: FullRoad) -> list[Branch]:
-    """All copies of one drive; changes constants of this process."""
+def drive(road: FullRoad, branches: Sequence[str]) -> list[Branch]:
+    """These copies of one drive; changes constants of this process."""
     _yield(NEVER)
     policy = Counted()
-    windows = Windows(policy, road.kind)
+    windows = Windows(policy, road.kind, branches)
     options = EpisodeOptions(**case(SHIPPED, road, TIMES[-1] + AFTER[-1] + 1.0).options)
     with closing(Host(options.scenario(), policy, math.radians(options.svo_deg))) as host:
         host.run(road.seed, hooks=[windows])
     return windows.rows
+
+
+def _order(row: Branch) -> tuple[int, int, float, int]:
+    return KINDS.index(row.kind), row.seed, row.time, [*BRANCHES].index(row.branch)
 
 
 # ---- the page ----
@@ -137,7 +166,7 @@ def _roads(rows: Sequence[Branch]) -> str:
 
 
 def _answers(rows: Sequence[Branch]) -> Iterator[str]:
-    for habit in HABITS:
+    for habit in YIELDING:
         windows = sum(row.branch == habit and row.yieldings > 0 for row in rows)
         changes = zip(_changes(rows, habit), AFTER, strict=True)
         at = [f"{change.text(0)} s after {after} s" for change, after in changes]
@@ -160,7 +189,7 @@ def _changes(rows: Sequence[Branch], habit: str) -> list[Figure]:
 
 def _table(rows: Sequence[Branch]) -> Iterator[str]:
     yield from markdown_head(["", "", "windows", "yieldings in each", *(f"after {a} s" for a in AFTER)])
-    for habit in HABITS:
+    for habit in YIELDING:
         name = habit  # in its first row only
         for kind in KINDS:
             of = [row for row in rows if row.kind == kind]
@@ -179,8 +208,9 @@ CONDITIONS = (
 WORDS = """# What do 100 s of yielding bring?
 
 Exact copies of one simulation differ in 100 s alone. In these, AVs follow one habit of
-[`yield-rule`](yielding.md) or never yield; before and afterwards the car drives alone. Change of
-the sum of all vehicles' delay, a window:
+[`yield-rule`](yielding.md) or never yield; before and afterwards the car drives alone. As a
+control, each AV eases off for vehicles that signal ahead of another AV. Change of the sum of all
+vehicles' delay, a window:
 
 {answer}
 
@@ -215,13 +245,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
         tempfile.TemporaryDirectory() as folder,
         ProcessPoolExecutor(args.workers, spawn, max_tasks_per_child=1) as pool,
     ):
-        known = {row.seed for row in rows}
-        roads = [r for r in full_roads(args.each, Path(folder), args.kinds) if r.seed not in known]
-        running = [pool.submit(drive, road) for road in roads]
+        known = {(row.seed, row.branch) for row in rows}
+        missing = {
+            road: [branch for branch in BRANCHES if (road.seed, branch) not in known]
+            for road in full_roads(args.each, Path(folder), args.kinds)
+        }
+        running = [pool.submit(drive, road, branches) for road, branches in missing.items() if branches]
         for number, done in enumerate(as_completed(running), 1):
-            rows = sorted([*rows, *done.result()], key=lambda row: (KINDS.index(row.kind), row.seed))
+            rows = sorted([*rows, *done.result()], key=_order)
             write(args.out / DATA, get_type_hints(Branch), rows)
-            print(f"yielding_window {number}/{len(roads)}", file=sys.stderr, flush=True)
+            print(f"yielding_window {number}/{len(running)}", file=sys.stderr, flush=True)
     write_page(args.out / PAGE, page(rows))
     print(args.out / PAGE)
 

@@ -19,7 +19,8 @@ INDEX = """\
 
 P: Valiente et al., prediction-aware cooperative driving. T: Toghi et al., altruistic maneuver planning.
 Both simulate with HighwayEnv, we with SUMO; scenarios and demands are ours. Every line is written by
-`python -m research page` from `research/claims/`. A claim without a verdict has not been driven yet.
+`python -m research page` from `research/claims/`. A verdict comes with its counts over conditions and with
+the paired differences to the arms that are named.
 
 | claim | source | must hold | verdict | page |
 |---|---|---|---|---|
@@ -48,7 +49,10 @@ def answer(claim: Claim, out: Path) -> str:
     paragraphs = [" ".join(part.split()) for part in text.split("\n\n")]
     pattern = r"\*\*([\w, ]+\.)\*\* .*?: (difference to .*)\. By condition: (.*)\."
     found = re.match(pattern, "".join(paragraphs[1:2]))
-    return f"**{found[1]}** By condition: {found[3]}; {found[2]}" if found else NOT_DRIVEN
+    if found is None:
+        return NOT_DRIVEN
+    effects = re.sub(r"difference to (`[^`]+`) (.*?), (\d+ pairs)", r"\2 against \1, \3", found[2])
+    return f"**{found[1]}** {found[3]}; {effects}"
 
 
 def stale(claim: Claim, work: Work, out: Path) -> Iterator[str]:

@@ -288,8 +288,9 @@ def markdown(
     page += ["", f"`{command}`", "", about, METHOD, "", f"![choices changed]({PICTURE})", ""]
     for policy, rows in tables.items():
         page += [f"## {policy}", "", *HEAD]
-        for row in rows:
-            cells = [row["input"], row["replacement"], str(row["decisions"])]
+        for above, row in zip([None, *rows], rows, strict=False):
+            named = "" if above and above["input"] == row["input"] else row["input"]
+            cells = [named, row["replacement"], str(row["decisions"])]
             cells += [
                 f"{row[f'{c}_count']}: {100 * row[c]:.1f} %"
                 f" ({100 * row[f'{c}_low']:.1f} to {100 * row[f'{c}_high']:.1f})"

@@ -85,8 +85,8 @@ def test_the_index_has_a_line_for_every_claim_and_says_what_is_not_driven(
     (tmp_path / "law.md").touch()
     text = index.write([found.claim, other], tmp_path).read_text()
     assert (
-        f"| {SMALL['sentence']} | ours | everywhere | **Yes.** By condition: 2 yes; "
-        "difference to `idm` -25.0 pp (-28.1 to -22.1), 800 pairs | [small](small.md) |" in text
+        f"| {SMALL['sentence']} | ours | everywhere | **Yes.** 2 yes; "
+        "-25.0 pp (-28.1 to -22.1) against `idm`, 800 pairs | [small](small.md) |" in text
     )
     assert "| Nobody drove this | ours | everywhere | Not driven yet. |  |" in text
     assert "Other pages: [law](law.md)." in text

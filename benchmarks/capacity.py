@@ -22,7 +22,6 @@ from statistics import fmean, stdev
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from benchmarks import published_capacity
@@ -34,6 +33,7 @@ from cosim.scenario.vet import vetted
 from cosim.seeding import TUNING_SEEDS
 from cosim.simulation.sumo import SumoSimulator
 from cosim.types import Timing
+from research.picture import save
 from sumo_scenarios import road_folders
 from sumo_scenarios.roads import NAMED, Minor, Section
 
@@ -289,8 +289,7 @@ def picture(rows: Sequence[Minute], file: Path) -> None:
     figure.supxlabel("density before the bottleneck, vehicles/km and lane")
     figure.supylabel("flow, vehicles/h")
     figure.axes[0].legend(fontsize=7)
-    with rc_context({"svg.hashsalt": "capacity", "svg.fonttype": "none"}):
-        figure.savefig(file, dpi=DPI, metadata={"Date": None})
+    save(figure, file, DPI)
 
 
 COLUMNS = (

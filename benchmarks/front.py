@@ -19,13 +19,13 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
 
-from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from benchmarks.drives import Case, measure
 from benchmarks.tables import markdown_head, markdown_row, write_page
 from cosim.report.statistics import Figure as Estimate
 from cosim.report.statistics import paired_change, pooled_rate
+from research.picture import save
 from sumo_scenarios.full_roads import LARGEST, FullRoad, full_roads
 from sumo_scenarios.roads import NAMED
 
@@ -169,8 +169,7 @@ def picture(rows: Sequence[Drive], file: Path) -> None:
     axes.set_ylabel("collisions with an AV in 1,000 AV-km")
     for text in axes.texts:
         text.set_fontsize(8)
-    with rc_context({"svg.hashsalt": "front", "svg.fonttype": "none"}):
-        figure.savefig(file, metadata={"Date": None})
+    save(figure, file)
 
 
 WORDS = """# The lawful car: what each habit costs and buys

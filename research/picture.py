@@ -29,11 +29,11 @@ def draw(found: Found, path: Path) -> None:
     save(_front(found) if found.claim.front else _points(found), path)
 
 
-def save(picture: Picture, path: Path) -> None:
-    """Write the picture as SVG; equal figures give an equal file."""
+def save(picture: Picture, path: Path, dpi: float | None = None) -> None:
+    """Write the picture as SVG; equal figures give an equal file. `dpi`: of rasterized parts."""
     drawn = io.StringIO()
     with rc_context(STYLE):
-        picture.savefig(drawn, format="svg", metadata={"Date": None, "Creator": None})
+        picture.savefig(drawn, format="svg", dpi=dpi or "figure", metadata={"Date": None, "Creator": None})
     numbers: dict[str, str] = {}
     text = CLIP.sub(lambda found: numbers.setdefault(found[0], f"clip{len(numbers)}"), drawn.getvalue())
     text = FINE.sub(lambda found: f"{float(found[0]):.2f}", text)

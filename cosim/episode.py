@@ -16,7 +16,7 @@ from cosim.errors import SimulationEnded
 from cosim.geometry.compiled import clock, compilation_time
 from cosim.metrics import MetricContext, MetricFactory, Metrics, joined
 from cosim.observation.observer import Observer
-from cosim.scenario import Scenario
+from cosim.scenario import AUTO, NONE, Scenario
 from cosim.scenario.manifest import manifest
 from cosim.seeding import generator
 from cosim.types import (
@@ -334,6 +334,9 @@ class Episode:
             reasons.append(f"{waiting} vehicles found no room and were never inserted: demand above capacity")
         if teleports := metrics["teleports"].value:
             reasons.append(f"{teleports} vehicles were teleported by SUMO")
+        named = self.scenario.asked.mission
+        if named not in (None, NONE, AUTO) and not self._missions:
+            reasons.append(f"no vehicle is the mission vehicle {named}")
         none_wanted = self.scenario.fleet.penetration == 0.0
         if self.steps and not none_wanted and not self._tally["decisions"] and not self._metrics.had_avs:
             reasons.append("no AV was ever on the road")

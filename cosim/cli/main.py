@@ -3,17 +3,33 @@
 import argparse
 import contextlib
 import importlib
+import re
 import signal
 import sys
 import threading
 import traceback
 from collections.abc import Iterator, Sequence
+from typing import NoReturn
 
 from cosim import __version__
 from cosim.cli import COMMANDS
-from cosim.errors import BadInput, CosimError, hint
+from cosim.errors import BadInput, CosimError, hint, one_of
 
 WITHOUT_FLAG = ("--scenario", "--world")  # flags that are a positional argument in commands of one scenario
+
+
+class Parser(argparse.ArgumentParser):
+    """Wrong arguments are a BadInput, like any other bad input."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raises BadInput for a message of argparse."""
+        about = re.fullmatch(r"argument (.+?): (?:(invalid choice): )?(?:'(.*?)' ?)?(.*)", message, re.DOTALL)
+        if about is None:
+            raise BadInput(message)
+        field, choice, value, problem = about.groups()
+        if choice:
+            one_of(value, re.findall(r"'(.*?)'", problem), field)
+        raise BadInput(problem, field=field, value=value)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -89,9 +105,7 @@ def _terminable() -> Iterator[None]:
 
 def parser(command: str = "") -> argparse.ArgumentParser:
     """Every flag of one command, or of all."""
-    top = argparse.ArgumentParser(
-        prog="cosim", description="Altruistic cooperative driving in mixed traffic on SUMO."
-    )
+    top = Parser(prog="cosim", description="Altruistic cooperative driving in mixed traffic on SUMO.")
     top.add_argument("--version", action="version", version=f"cosim {__version__}", help="cosim's version")
     commands = top.add_subparsers(required=True, metavar="COMMAND")
     for name in (command,) if command in COMMANDS else COMMANDS:

@@ -1,5 +1,7 @@
 """Mission: success and time of the mission vehicle."""
 
+from collections.abc import Iterable
+
 from cosim.metrics.context import MetricContext
 from cosim.types import Metric, Snapshot
 
@@ -10,7 +12,8 @@ class MissionSuccess:
     """Success is reaching a goal lane without an earlier collision (figures.md, Mission and distance).
 
     All mission vehicles must succeed; the time is that of the last. NA without a mission or goal, or before a
-    mission vehicle appears; with mission `auto`, until one has been on a lane that ends or gives way.
+    mission vehicle appears; with mission `auto`, until one has been on a lane that ends or gives way, and its
+    arrival is a success too.
     """
 
     def reset(self, first: Snapshot, context: MetricContext) -> None:
@@ -29,6 +32,8 @@ class MissionSuccess:
         for collision in snapshot.events.collisions:  # they precede this frame's positions
             self._crashed.update((collision.collider, collision.victim))
         self._standing.difference_update(snapshot.events.arrived)
+        if self._auto:  # its route may end before any goal lane
+            self._reach(snapshot, self._reached.keys() & snapshot.events.arrived)
         for row in snapshot.mission.nonzero()[0].tolist():
             name, lane = snapshot.ids[row], int(snapshot.lane[row])
             if self._auto and name not in self._reached and not self._struggles(lane):
@@ -39,7 +44,12 @@ class MissionSuccess:
                 self._standing.add(name)
             else:
                 self._standing.discard(name)
-            if name not in self._crashed and lane in self._goal:
+            if lane in self._goal:
+                self._reach(snapshot, (name,))
+
+    def _reach(self, snapshot: Snapshot, names: Iterable[str]) -> None:
+        for name in names:
+            if name not in self._crashed and self._reached[name] is None:
                 self._reached[name] = snapshot.time - self._begin
 
     def _struggles(self, lane: int) -> bool:

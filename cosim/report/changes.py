@@ -13,6 +13,8 @@ GOOD, BAD = "good", "bad"
 MEASURES = {
     "collision_rate": "collisions",
     "av_caused_collision_rate": "AV-caused collisions",
+    "av_near_misses_ttc_per_av_hour": "the AVs' near-misses (TTC)",
+    "hard_brakings_av": "the AVs' hard brakings",
     "mission_success_rate": "mission success",
     "dt_mission_m": "the mission vehicle's distance",
     "dt_av_m": "the AVs' distance",

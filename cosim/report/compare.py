@@ -12,7 +12,7 @@ import numpy as np
 from cosim.errors import BadInput
 from cosim.report import wording
 from cosim.report.figures import Measure, Row
-from cosim.report.pairing import Group, Side, pair, title
+from cosim.report.pairing import MISSION_COLUMNS, Group, Side, pair, title
 from cosim.report.statistics import (
     Figure,
     discordant,
@@ -28,8 +28,6 @@ from cosim.report.statistics import (
 )
 from cosim.report.thresholds import CHANGE, DIFFERENCE, Threshold, parse
 
-# Figures of the mission vehicle.
-MISSION_COLUMNS = frozenset({"mission_success", "mission_failed_at_end", "mission_time_s", "dt_mission_m"})
 PASSED, FAILED, SKIPPED = "passed", "failed", "skipped"
 
 

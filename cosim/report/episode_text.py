@@ -35,6 +35,7 @@ ROWS = {
     **{name: words for name, words in EVERYBODY.items() if name not in ("mean_squared_wait_s2", "co2_kg")},
     "collisions": "collisions",
     "av_caused_collisions": "collisions caused by an AV",
+    "uncounted_overlaps": "overlaps that are no collisions",
     "min_ttc_s": "smallest time to collision",
     **{
         f"{prefix}near_misses_{kind}": f"near-misses{of}, {what}"
@@ -175,7 +176,7 @@ def _table(episodes: Sequence[EpisodeResult], every: bool) -> list[str]:
         values = [metric.value for metric in found]
         if all(value is None for value in values):
             continue
-        if name not in ROWS or name in ALWAYS_SHOWN or any(values):
+        if name not in ROWS or name in ALWAYS_SHOWN or any(values) or found[0].better == "higher":
             rows.append((_words(name, found), *map(_without_unit, found), _difference(found), name))
         elif not _BREAKDOWN.search(name):
             zero.append(ROWS[name].removeprefix("AVs: "))

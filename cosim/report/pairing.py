@@ -19,6 +19,8 @@ from cosim.report.run_folder import SETTINGS, Run
 from cosim.report.summary import GROUP, mission_guessed, not_comparable
 from cosim.workers.tasks import BAD_INPUT, OK
 
+# Figures of the mission vehicle.
+MISSION_COLUMNS = frozenset({"mission_success", "mission_failed_at_end", "mission_time_s", "dt_mission_m"})
 PAIR = tuple(name for name in GROUP if name != "policy")
 ACROSS = tuple(name for name in PAIR if name not in ("scenario", "demand"))  # may differ
 
@@ -225,11 +227,20 @@ def _group(pairs: list[tuple[Row, Row]], fields: tuple[str, ...], episodes: tupl
         identity={n: first.get(n) for n in PAIR if n not in differing},
         a=drivers[0],
         b=drivers[1],
-        pairs=[(x, y) for x, y in pairs if x["status"] == OK and y["status"] == OK],
+        pairs=[_same_mission(x, y) for x, y in pairs if x["status"] == OK and y["status"] == OK],
         failed=[row for row in without_figures if row["status"] != BAD_INPUT],
         refused=[row for row in without_figures if row["status"] == BAD_INPUT],
         unpaired=(episodes[0] - len(pairs), episodes[1] - len(pairs)),
     )
+
+
+def _same_mission(*pair: Row) -> tuple[Row, Row]:
+    """The pair; without the figures of the mission vehicle where the guessed vehicles differ."""
+    a, b = pair
+    if a.get("mission_vehicle") != b.get("mission_vehicle") and any(map(mission_guessed, pair)):
+        nothing = dict.fromkeys(MISSION_COLUMNS)
+        return {**a, **nothing}, {**b, **nothing}
+    return a, b
 
 
 def _name(row: Row) -> str:

@@ -4,6 +4,7 @@ A user's configuration is never passed to SUMO unchanged: its outputs could writ
 `remote-port` would wait for ever (docs/reference/sumo.md).
 """
 
+import difflib
 import math
 import re
 from collections.abc import Collection, Sequence
@@ -44,6 +45,7 @@ OTHER_ROOTS = frozenset(
 )
 INPUTS = ("net-file", "route-files", "additional-files")
 CLOCK = ("begin", "end", "step-length")
+SAME_WORD = 0.75  # similarity to one of these names; at most 0.7 for SUMO's other options
 # Options with a list of input files, relative to the configuration's folder.
 FILE_OPTIONS = frozenset(
     {
@@ -138,6 +140,9 @@ def read(path: Path, replaced: Collection[str] = ()) -> SumoConfig:
         if name == "lateral-resolution" and _off(value, path):
             continue
         if not keeps(name):
+            if near := difflib.get_close_matches(name, (*INPUTS, *CLOCK), 1, SAME_WORD):
+                problem = f"SUMO has no such option, did you mean {near[0]!r}?"
+                raise BadInput(problem, file=path, field=name, value=value)
             ignored.append(f"{name}={value}{_SET_ASIDE.get(name, '')}")
         elif name in FILE_OPTIONS:
             kept.append((name, ",".join(str(p) for p in files(value, folder, path, name))))

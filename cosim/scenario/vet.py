@@ -222,7 +222,8 @@ def _check_mission(scenario: Scenario, demands: list[Demand]) -> None:
     """Raises BadInput if the mission vehicle is not in the demand, as far as ids are known in advance."""
     mission = scenario.mission
     wanted = mission.vehicles
-    if not wanted or scenario.built_in or any(demand.makes_vehicles for demand in demands):
+    own = scenario.built_in and scenario.asked.mission is None  # a file of the user may lack its vehicle
+    if not wanted or own or any(demand.makes_vehicles for demand in demands):
         return
     vehicles = [name for demand in demands for name in demand.vehicles]
     flows = {name for demand in demands for name in demand.flows}  # their vehicles are FLOW.0, FLOW.1, ...

@@ -11,6 +11,7 @@ import contextlib
 import multiprocessing
 import os
 import pickle
+import shutil
 import signal
 import sys
 import tempfile
@@ -26,6 +27,7 @@ from cosim.errors import CosimError, SimulationCrashed, SimulationTimeout
 from cosim.workers import untrusted
 from cosim.workers.memory import keep_freed_memory
 
+STDERR = "stderr"  # file in a worker's folder
 STDERR_KEPT = 4000  # last characters of a crashed process's stderr, for the error
 
 _CONTEXT = multiprocessing.get_context("spawn")
@@ -57,14 +59,13 @@ class Worker(contextlib.AbstractContextManager["Worker"]):
     ) -> None:
         self._timeout = timeout
         self._start_timeout = start_timeout
-        handle, path = tempfile.mkstemp(prefix="cosim-worker-", suffix=".stderr")
-        os.close(handle)
-        self._stderr = Path(path)
+        self._folder = Path(tempfile.mkdtemp(prefix="cosim-worker-"))  # of its temporary files
+        self._stderr = (self._folder / STDERR).open("xb+", buffering=0)
         self._call_begin = 0  # bytes of stderr that belong to earlier calls
         self._pipe, theirs = _CONTEXT.Pipe()
         self._untrusted = untrusted.is_untrusted(factory, *arguments)
         self._process = (untrusted.Process if self._untrusted else _CONTEXT.Process)(
-            target=_serve, args=(theirs, factory, arguments, path), name=name, daemon=True
+            target=_serve, args=(theirs, factory, arguments, self._folder), name=name, daemon=True
         )
         # Ctrl-C reaches the parent alone, which decides: blocked signals stay blocked in a new process
         resource_tracker.ensure_running()  # its start would unblock the signal again
@@ -92,7 +93,7 @@ class Worker(contextlib.AbstractContextManager["Worker"]):
         if self._closed:
             raise SimulationCrashed("the simulation's process has ended already")
         self._wait()
-        self._call_begin = self._stderr.stat().st_size
+        self._call_begin = self._stderr.seek(0, os.SEEK_END)
         try:
             self._pipe.send((method, arguments, options, progress is not None))
         except (BrokenPipeError, OSError):
@@ -117,7 +118,8 @@ class Worker(contextlib.AbstractContextManager["Worker"]):
             self._process.join()
         self._process.close()  # frees its descriptors now, not when the garbage collector comes
         self._pipe.close()
-        self._stderr.unlink(missing_ok=True)
+        self._stderr.close()
+        shutil.rmtree(self._folder, ignore_errors=True)  # also what a killed simulation has left
 
     def __exit__(self, *error: object) -> None:
         self.close()
@@ -193,9 +195,9 @@ class Worker(contextlib.AbstractContextManager["Worker"]):
 
     def _call_stderr(self) -> str:
         """The stderr of the process during this call."""
-        with self._stderr.open("rb") as file:
-            file.seek(max(self._call_begin, self._stderr.stat().st_size - 4 * STDERR_KEPT))
-            return file.read(4 * STDERR_KEPT).decode("utf-8", "replace").strip()[-STDERR_KEPT:]
+        end = self._stderr.seek(0, os.SEEK_END)
+        self._stderr.seek(max(self._call_begin, end - 4 * STDERR_KEPT))
+        return self._stderr.read(4 * STDERR_KEPT).decode("utf-8", "replace").strip()[-STDERR_KEPT:]
 
 
 @contextlib.contextmanager
@@ -236,11 +238,15 @@ def _one_blas_thread() -> Iterator[None]:
                 del os.environ[_BLAS_THREADS]
 
 
-def _serve(pipe: Connection, factory: Callable[..., Any], arguments: tuple[Any, ...], stderr: str) -> None:
-    """The worker's main loop. It ends when the pipe breaks, so the worker never outlives its parent."""
+def _serve(pipe: Connection, factory: Callable[..., Any], arguments: tuple[Any, ...], folder: Path) -> None:
+    """The worker's main loop. It ends when the pipe breaks, so the worker never outlives its parent.
+
+    `folder`: of temporary files, and of STDERR.
+    """
     keep_freed_memory()
+    tempfile.tempdir = str(folder)
     os.dup2(2, 1)  # prints of a policy go to stderr: stdout is for the caller's document
-    file = os.open(stderr, os.O_RDWR | os.O_APPEND)  # readable, for `cosim.simulation.stderr`
+    file = os.open(folder / STDERR, os.O_RDWR | os.O_APPEND)  # readable, for `cosim.simulation.stderr`
     os.dup2(file, 2)
     os.close(file)
     target, done = None, False
@@ -278,4 +284,5 @@ def _serve(pipe: Connection, factory: Callable[..., Any], arguments: tuple[Any, 
     if target is not None and hasattr(target, "close"):
         with contextlib.suppress(Exception):
             target.close()
+    shutil.rmtree(folder, ignore_errors=True)  # a killed caller does not
     done = True

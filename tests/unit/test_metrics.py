@@ -284,6 +284,19 @@ def test_without_a_goal_of_its_own_a_mission_begins_on_a_lane_that_gives_way() -
     assert drive({"m": steady(0.0, 20.0, mission=True)}, mission="auto", goal=goal)["mission_success"] is None
 
 
+def test_without_a_goal_of_its_own_a_mission_ends_with_the_route_at_the_latest() -> None:
+    lane = steady(0.0, 20.0, mission=True, lane=lambda _: 2)
+    arrived = {30: Events(arrived=("m",))}
+    seen = drive({"m": lane}, mission="auto", goal=frozenset({0}), events=arrived)
+    assert (seen["mission_success"], seen["mission_time_s"]) == (True, pytest.approx(30 * FRAME))
+    crashed = {20: Events(collisions=(crash("hv", "m"),)), **arrived}
+    cars = {"m": lane, "hv": steady(-30.0, 20.0)}
+    assert drive(cars, mission="auto", goal=frozenset({0}), events=crashed)["mission_success"] is False
+    assert (
+        drive({"m": lane}, mission="merge", goal=frozenset({0}), events=arrived)["mission_success"] is False
+    )
+
+
 def test_a_mission_vehicle_that_stands_at_the_end_of_its_lane_has_failed() -> None:
     stuck = Car(
         lambda t: min(20.0 * t, 120.0),

@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import signal
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from multiprocessing import resource_tracker
@@ -58,6 +59,9 @@ class Served:
     def write_and_crash(self) -> None:
         os.write(2, b"Error: the net is broken\n")
         os.kill(os.getpid(), signal.SIGSEGV)
+
+    def temporary(self) -> str:
+        return tempfile.mkstemp()[1]
 
     def crash_with_sumos_stderr(self) -> None:
         with SumoStderr() as stderr:
@@ -185,9 +189,28 @@ def test_closing_closes_the_object_the_process_and_the_files(tmp_path: Path) -> 
     worker.close()
     assert (tmp_path / "bequest").read_text() == "closed"
     assert gone(pid)
-    assert not worker._stderr.exists()
+    assert not worker._folder.exists()
     del worker  # multiprocessing frees its own two descriptors with the object
     assert len(os.listdir("/proc/self/fd")) <= files
+
+
+def test_the_temporary_files_of_a_killed_process_are_deleted() -> None:
+    with Worker(Served) as worker:
+        file = Path(worker.call("temporary"))
+        assert file.exists()
+        worker.kill()
+    assert not file.exists()
+
+
+def test_a_process_whose_caller_is_killed_deletes_its_files() -> None:
+    worker = Worker(Served)
+    folder, pid = worker._folder, worker.pid
+    worker._pipe.close()  # as the end of the caller does
+    deadline = time.monotonic() + 20.0
+    while not gone(pid) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not folder.exists()
+    worker.close()
 
 
 def test_two_workers_are_two_processes(worker: Worker) -> None:

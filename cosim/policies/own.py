@@ -1,6 +1,7 @@
 """A user's own policy as `cosim.types.Policy`: class, factory or function; errors name the user's code."""
 
 import inspect
+import math
 import operator
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -80,13 +81,19 @@ class OwnPolicy:
         return found
 
     def _decision(self, value: Any) -> Decision:
+        found = value
         if isinstance(value, ContinuousAction):
-            value = value.decision
-        whole: Decision = value if isinstance(value, Decision) else Decision(value)
+            found = value.decision if value.lane_offset in (-1, 0, 1) else None
+        whole: Decision = found if isinstance(found, Decision) else Decision(found)
         try:
+            if not math.isfinite(whole.accel or 0.0):
+                raise ValueError
             return whole._replace(action=MetaAction(operator.index(whole.action)))
         except (TypeError, ValueError):
-            problem = f"must decide for a Decision, a MetaAction ({ACTIONS}), a ContinuousAction or None"
+            problem = (
+                f"must decide for a Decision, a MetaAction ({ACTIONS}), a ContinuousAction or None, "
+                "with a finite acceleration and a lane offset of 1, 0 or -1"
+            )
             raise self._wrong(problem, "decide", value) from None
 
     def _wrong(self, problem: str, field: str, value: object = None) -> BadInput:

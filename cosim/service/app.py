@@ -5,8 +5,9 @@ import errno
 import json
 import logging
 import os
+import re
 import shutil
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from typing import Any
 
 from fastapi import APIRouter, FastAPI, Request, Response
@@ -35,7 +36,6 @@ from cosim.service.problems import Refused
 from cosim.service.processes import Processes
 from cosim.service.readiness import Check, Readiness
 from cosim.service.replays import Replays
-from cosim.service.requests import RunRequest
 from cosim.service.routes_live import live_router
 from cosim.service.routes_page import page_router
 from cosim.service.routes_runs import runs_router
@@ -48,6 +48,7 @@ from cosim.service.uploads import Uploads
 from cosim.service.warm import Warmth
 from cosim.types import Preset
 
+BRANCH = re.compile(r"int|str|float|bool|Continuous|(list|dict|constrained|function)\b.*")  # of a union
 log = logging.getLogger("cosim.service")
 ABOUT = """Co-simulate altruistic cooperative driving on SUMO: submit runs of many episodes and read their
 results, or drive step by step in a session."""
@@ -176,15 +177,18 @@ def _answer_problems(app: FastAPI, settings: Settings) -> None:
         return answer(503, "the server's database cannot be reached or written now")
 
     @app.exception_handler(RequestValidationError)
-    def malformed(_: Request, error: RequestValidationError) -> Response:
-        first = error.errors()[0]
-        place = [str(part) for part in first["loc"] if part not in ("body", "query", "path", "header")]
-        problem, value = str(first["msg"]), first.get("input")
+    def malformed(request: Request, error: RequestValidationError) -> Response:
+        found = error.errors()
+        # of a union every branch has errors: those that fit best are the deepest
+        first = max(found, key=lambda one: (one["type"] == "extra_forbidden", len(one["loc"])))
+        place = _place(first)
+        problem = "; ".join(dict.fromkeys(str(one["msg"]) for one in found if _place(one) == place))
+        value = first.get("input")
         if first["type"] == "json_invalid":
             problem, place = f"not JSON: {first['ctx']['error']} at character {place[-1]}", []
         elif first["type"] == "extra_forbidden":
-            problem = f"unknown field{hint(place[-1], RunRequest.model_fields)}"
-        plain = value if isinstance(value, str | int | bool | None) else None
+            problem = f"unknown field{hint(place[-1], _fields(request)) if len(place) == 1 else ''}"
+        plain = value if isinstance(value, str | int | float | bool | None) else None
         return answer(422, problem, ".".join(place) or None, plain)
 
     @app.exception_handler(HTTPException)
@@ -192,6 +196,19 @@ def _answer_problems(app: FastAPI, settings: Settings) -> None:
         found = answer(error.status_code, str(error.detail))
         found.headers.update(error.headers or {})
         return found
+
+
+def _place(error: Mapping[str, Any]) -> list[str]:
+    """The path of a field, without the part of the request and the branches of unions."""
+    parts = [str(part) for part in error["loc"] if part not in ("body", "query", "path", "header")]
+    return [part for part in parts if not BRANCH.fullmatch(part)]
+
+
+def _fields(request: Request) -> list[str]:
+    """The fields of the request's body."""
+    body = getattr(request.scope.get("route"), "body_field", None)
+    model = None if body is None else body.field_info.annotation
+    return [*getattr(model, "model_fields", ())]
 
 
 def _disk(settings: Settings) -> Check:

@@ -106,6 +106,31 @@ def test_a_session_of_nonsense_names_the_field(server: Server, body: dict[str, A
     assert (answer.status_code, answer.json()["field"]) == (422, field), answer.text
 
 
+def test_a_wrong_field_of_a_reset_or_an_act_is_named_with_its_value(server: Server) -> None:
+    path = (
+        f"/api/sessions/{server.http.post('/api/sessions', json={'scenario': 'merge', **WORDS}).json()['id']}"
+    )
+    av = server.http.post(f"{path}/reset", json={"seed": 7}).json()["avs"][0]
+
+    def refused(call: str, body: dict[str, Any]) -> tuple[str, Any, str]:
+        found = server.http.post(f"{path}/{call}", json=body)
+        assert found.status_code == 422, found.text
+        return found.json()["field"], found.json()["value"], found.json()["problem"]
+
+    assert refused("reset", {"sed": 7}) == ("sed", 7, "unknown field, did you mean 'seed'?")
+    field, value, problem = refused("act", {"actions": {av: {"accel": "x"}}})
+    assert (field, value) == (f"actions.{av}.accel", "x")
+    assert "valid number" in problem
+    field, value, problem = refused("act", {"actions": {av: {"accel": -1.0, "lane_offset": 5}}})
+    assert (field, value, problem) == (
+        f"actions.{av}.lane_offset",
+        5,
+        "Input should be less than or equal to 1",
+    )
+    assert refused("act", {"actions": {av: {"acel": -1.0}}})[0] == f"actions.{av}.acel"
+    server.http.delete(path)
+
+
 def test_an_idle_session_ends_by_itself_and_a_dead_one_begins_anew(server: Server) -> None:
     with client.open(server.url, "merge", **WORDS) as session:
         session.reset(1)

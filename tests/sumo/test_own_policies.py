@@ -80,6 +80,12 @@ class Eases(Holds):
 class EasesToo(Holds):
     def answer(self, av): return Decision(MetaAction.LANE_LEFT, accel=-0.5)
 
+class Endless(Holds):
+    def answer(self, av): return ContinuousAction(float("nan"), 0)
+
+class Leaps(Holds):
+    def answer(self, av): return ContinuousAction(1.0, 3)
+
 class Nothing: ...
 
 def factory(): return Holds()
@@ -169,6 +175,8 @@ def test_a_class_a_factory_and_a_function_of_ones_own_drive(code: Path, tmp_path
             "decide='left': must decide for a Decision, a MetaAction (0 to 4), a ContinuousAction or None",
         ),
         ("Wrapped", "must decide for a Decision, a MetaAction (0 to 4), a ContinuousAction or None"),
+        ("Endless", "decide=ContinuousAction(accel=nan, lane_offset=0): must decide for"),
+        ("Leaps", "with a finite acceleration and a lane offset of 1, 0 or -1"),
         ("Filed", "Filed.files='nowhere.zip': no such file"),
         ("Numbered", "Numbered.av_parameters=('lcSpeedGain', 3): must map SUMO's parameters to text"),
         ("Leaves", "decide: SystemExit: 3"),

@@ -117,6 +117,7 @@ def work(args: argparse.Namespace) -> int:
     for flag, wanted in (("--output", args.output), ("--replay", args.replay)):
         if wanted and not args.out:
             raise BadInput("needs a run folder to write into: --out DIR", field=flag)
+    _check_folder(args.out)
     if args.replay:
         with extra("film", field="--replay"):
             import av  # noqa: F401  # before anything is driven
@@ -238,6 +239,15 @@ def _beside(args: argparse.Namespace) -> EpisodeOptions:
     if label(case.policy) == label(case_of(args).policy):
         raise BadInput("is the policy that drives already", field="--beside", value=args.beside)
     return case
+
+
+def _check_folder(out: str | None) -> None:
+    """Raises BadInput for a folder with the results of several episodes; an episode's may be replaced."""
+    if out is not None and not Path(out, "result.json").exists():
+        for name in ("manifest.json", "store.sqlite"):
+            if Path(out, name).exists():
+                problem = f"holds {name} of several episodes: name another folder"
+                raise BadInput(problem, field="--out", value=out)
 
 
 def _served(args: argparse.Namespace) -> tuple[int, int] | None:

@@ -86,7 +86,7 @@ class SumoEnv(gymnasium.Env[Observation, Any]):
         wanted = str((options or {}).get("learner", self._wanted))
         while not (found := self._choose(views, wanted)):
             if self._session.over:
-                raise no_av(seed, None if wanted in (MISSION, NEAREST) else wanted)
+                raise no_av(seed, wanted)
             views = self._session.act({}).observations
         self.learner = found
         self._view = views[found]
@@ -148,10 +148,13 @@ def nearest_upstream(views: Mapping[str, View]) -> str:
     return min(upstream or views, key=lambda n: (upstream.get(n, 0.0), n), default="")
 
 
-def no_av(seed: int, name: str | None) -> BadInput:
+def no_av(seed: int, name: str = MISSION) -> BadInput:
     """The error for a missing learner, with its remedy."""
-    if name is not None:
-        return BadInput(f"this AV was never on the road in episode {seed}", field="learner", value=name)
+    if name not in (MISSION, NEAREST):
+        words = f"; an AV's name, {MISSION!r} or {NEAREST!r} is needed"
+        return BadInput(
+            f"this AV was never on the road in episode {seed}{words}", field="learner", value=name
+        )
     return BadInput(
         "no AV was ever on the road: give penetration=0.2, the share of AVs, or a demand with AVs",
         field="seed",

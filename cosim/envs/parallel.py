@@ -109,7 +109,7 @@ class SumoParallelEnv(ParallelEnv):  # type: ignore[misc]
         self._join(views)
         self._drive_on()
         if not self._driving:
-            raise no_av(seed, None)
+            raise no_av(seed)
         return self._observations(self.agents), {a: self._info(a) for a in self.agents}
 
     def step(self, actions: dict[str, Any]) -> Step:

@@ -199,7 +199,7 @@ def _words(name: str, found: Sequence[Metric]) -> str:
     unit = found[0].unit
     counted = all(metric.value is None or isinstance(metric.value, int) for metric in found)
     words = ROWS.get(name, name)
-    return f"{words}, {unit}" if unit and not counted else words
+    return f"{words}, {unit}" if unit and unit != "share" and not counted else words
 
 
 def _without_unit(metric: Metric) -> str:

@@ -14,8 +14,9 @@ from cosim.report import wording
 from cosim.report.changes import changes
 from cosim.report.compare import FAILED, PASSED, SKIPPED, Compared, Comparison, PairedFigure
 from cosim.report.figures import HEADLINE, INCIDENCES, Row
-from cosim.report.pairing import driver
+from cosim.report.pairing import Group, driver
 from cosim.report.result import EVERYBODY, LAW
+from cosim.report.summary import not_comparable, reasons
 
 _MARK = {PASSED: "pass", FAILED: "FAIL", SKIPPED: "n/a "}
 _EMOJI = {PASSED: "✅ pass", FAILED: "❌ **fail**", SKIPPED: "n/a"}
@@ -149,6 +150,11 @@ def junit(comparison: Comparison, path: Path) -> None:
 # ---- inside ----
 
 
+def _reasons(group: Group) -> str:
+    """Why episodes of the pairs are not comparable."""
+    return "; ".join(reasons([row for pair in group.pairs for row in pair if not_comparable(row)]))
+
+
 def _pairs(count: int) -> str:
     return f"{count} pair{'s' * (count != 1)}"
 
@@ -246,7 +252,9 @@ def _notes(compared: Compared) -> list[str]:
     notes = [f"{_pairs(len(group.pairs))}{caution}, A {driver(group.a)}, B {driver(group.b)}"]
     counted = {
         f"{_pairs(group.identical)} drove exactly alike (same trace hash)": group.identical,
-        f"{_pairs(group.not_comparable)} with an episode that is not comparable": group.not_comparable,
+        f"{_pairs(group.not_comparable)} with an episode that is not comparable ({_reasons(group)})": (
+            group.not_comparable
+        ),
         f"{_pairs(group.mission_guessed)} with a guessed mission vehicle: its figures feed no gate": (
             group.mission_guessed
         ),
@@ -267,7 +275,9 @@ def _notes(compared: Compared) -> list[str]:
 def _unfinished(comparison: Comparison) -> list[str]:
     """The driven part of an unfinished batch; [] for a finished one."""
     pairs = sum(len(compared.group.pairs) for compared in comparison.groups)
-    return [f"unfinished: {'; '.join(comparison.unfinished)}, {pairs} pairs"] if comparison.unfinished else []
+    return (
+        [f"unfinished: {'; '.join(comparison.unfinished)}, {_pairs(pairs)}"] if comparison.unfinished else []
+    )
 
 
 def _unmatched(comparison: Comparison) -> list[str]:

@@ -339,7 +339,7 @@ class Episode:
             reasons.append(f"no vehicle is the mission vehicle {named}")
         none_wanted = self.scenario.fleet.penetration == 0.0
         if self.steps and not none_wanted and not self._tally["decisions"] and not self._metrics.had_avs:
-            reasons.append("no AV was ever on the road")
+            reasons.append("no AV was ever on the road: --penetration, --av-type or --av-ids choose some")
         return tuple(reasons)
 
 

@@ -28,15 +28,16 @@ def switch(light: str) -> None:
 
 
 def main() -> None:
-    """Step with SUMO until it ends."""
+    """Step with SUMO until its end time, if it has one, or until it ends."""
     traci.init(int(sys.argv[1]), numRetries=60)
     traci.setOrder(1)
-    lights = traci.trafficlight.getIDList()
+    lights, end = traci.trafficlight.getIDList(), traci.simulation.getEndTime()
     try:
-        while True:
+        while end < 0.0 or traci.simulation.getTime() < end:
             traci.simulationStep()
             for light in lights:
                 switch(light)
+        traci.close()
     except traci.exceptions.FatalTraCIError:
         print("SUMO has ended")
 

@@ -40,7 +40,8 @@ class OwnPolicy:
         self._inner, self._place = inner, file or name.place
         lacking = [field for field in NEEDED if not hasattr(inner, field)]
         if lacking:
-            raise self._wrong(f"a policy needs {', '.join(lacking)} (cosim.types.Policy)", name.member)
+            needed = f"a policy needs {', '.join(lacking)} (cosim.types.Policy); a function, one argument"
+            raise self._wrong(needed, name.member)
         if not isinstance(inner.observation, ObservationConfig):
             raise self._wrong("must be a cosim.types.ObservationConfig", f"{name.member}.observation")
         self.name = name.label

@@ -23,7 +23,8 @@ DEFAULT_MISSION = ("reach its goal", "reached its goal")  # in a user's file
 GUESSED = "guessed: its figures feed no gate (--mission ID names it, --mission none does without)"
 MAX_REASONS = 4  # of interventions, in the list
 ALWAYS_SHOWN = ("collisions", "av_caused_collisions", "mission_success")  # also when 0
-_BREAKDOWN = re.compile(r"^av_|_av$|_hv$|^worst|^veto")  # names of parts of another figure: not listed as 0
+# Names of parts of another figure: not listed as 0
+_BREAKDOWN = re.compile(r"^av_|_av$|_hv$|^worst|^veto|^uncounted")
 # Rows of the table, in words.
 ROWS = {
     "mission_success": "mission fulfilled",

@@ -312,6 +312,8 @@ def _difference(a: Figure, b: Figure, part_a: Array, part_b: Array, normal: bool
         return Figure(value, value - reach, value + reach)
     scatter = np.ptp(part_a) > 0.0 and np.ptp(part_b) > 0.0
     correlation = float(np.corrcoef(part_a, part_b)[0, 1]) if scatter else 0.0
+    if len(part_a) < NORMAL_SAMPLES:  # too few pairs to show that they agree
+        correlation = min(correlation, 0.0)
     sides = (b.value - b.low, a.high - a.value), (b.high - b.value, a.value - a.low)
     down, up = (math.sqrt(max(p**2 + q**2 - 2.0 * correlation * p * q, 0.0)) for p, q in sides)
     return Figure(value, value - down, value + up)

@@ -251,6 +251,13 @@ def test_the_difference_of_rates_is_of_pooled_rates_and_pairs_help() -> None:
     assert 0.0 < change.low < change.value < change.high
 
 
+def test_three_pairs_that_agree_are_no_proof_that_pairs_do() -> None:
+    before = np.array([[1.0, 3.0, 2.0], [0.2, 0.2, 0.2]])
+    after = before + np.array([[1.0], [0.0]])
+    found, alone = paired_rate(before, after), pooled_rate(*before)
+    assert found.high - found.low > alone.high - alone.low
+
+
 def test_the_difference_of_a_few_events_keeps_the_doubt_of_both_rates() -> None:
     """Nothing on either side in 10 hours: each may be 0.37 an hour."""
     nothing = np.array([np.zeros(10), np.ones(10)])

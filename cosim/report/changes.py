@@ -9,6 +9,7 @@ from cosim.report.compare import PairedFigure
 from cosim.report.statistics import CONFIDENCE
 
 GOOD, BAD = "good", "bad"
+FEWEST = 6  # pairs for an answer: with five of equal sign the exact sign test has p 0.06
 # The measures that are judged, in words.
 MEASURES = {
     "collision_rate": "collisions",
@@ -59,11 +60,11 @@ def changes(figures: Mapping[str, PairedFigure]) -> Changes:
 def tone(figure: PairedFigure) -> str:
     """Whether a difference is good or bad; "" if it can be due to chance.
 
-    It can if the interval contains 0, or if McNemar's exact p of a rate is 5 % or more: with few crashes
+    It can if there are fewer than FEWEST pairs, if the interval contains 0, or if McNemar's exact p of a rate is 5 % or more: with few crashes
     Tango's interval may exclude 0 although the exact test is not significant.
     """
     d = figure.difference
-    chance = math.isnan(d.low) or d.low <= 0.0 <= d.high
+    chance = figure.n < FEWEST or math.isnan(d.low) or d.low <= 0.0 <= d.high
     if chance or (figure.p is not None and figure.p >= 1.0 - CONFIDENCE) or not figure.measure.better:
         return ""
     return GOOD if (d.value > 0.0) == (figure.measure.better == "higher") else BAD

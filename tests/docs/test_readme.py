@@ -50,4 +50,3 @@ def test_its_python_runs_as_a_file(number: int, tmp_path: Path) -> None:
     printed = shell("python -W ignore user.py", tmp_path)
     if number == 0:
         assert re.fullmatch(r"Metric\(value=[\d.]+, unit='s', better='lower'\)\n", printed)
-        assert "seed=200000" in printed

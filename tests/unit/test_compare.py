@@ -546,3 +546,28 @@ def test_everybodys_delay_is_gated_and_named_as_worse(
     code, out, _ = run(capsys, f"{folder}:idm", f"{folder}:kind", "--json")
     group = json.loads(out)["groups"][0]
     assert [group["worse"][0].split(" +")[0], len(group["worse"])] == ["everybody's delay", 1]
+
+
+def test_fewer_than_six_pairs_make_nothing_better_or_worse(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for pairs, word in ((5, "no difference shown"), (6, "worse")):
+        late = [10.0 + 0.1 * k for k in range(pairs)]
+        later = {"total_delay_s": [1.05 * x for x in late]}
+        before = cell("idm", pairs, columns={"total_delay_s": late})
+        folder = write(tmp_path / str(pairs), before, cell("kind", pairs, columns=later))
+        _, out, _ = run(capsys, f"{folder}:idm", f"{folder}:kind")
+        assert re.search(rf"  {word}: [^:]*everybody's delay", out)
+
+
+def test_the_mission_figures_of_two_guessed_vehicles_are_no_pair(tmp_path: Path) -> None:
+    guesses = {"mission_guessed": [True] * 3, "dt_mission_m": [100.0] * 3}
+    other = guesses | {"mission_vehicle": ["r.7", "r.7", "r.8"], "dt_mission_m": [100.0, 100.0, 160.0]}
+    folder = write(
+        tmp_path / "run",
+        cell("idm", 3, columns=guesses | {"mission_vehicle": ["r.7"] * 3}),
+        cell("kind", 3, columns=other),
+    )
+    figures = compare(side(f"{folder}:idm"), side(f"{folder}:kind")).groups[0].figures
+    assert (figures["dt_mission_m"].n, figures["dt_mission_m"].difference.value) == (2, 0.0)
+    assert figures["dt_mean_m"].n == 3

@@ -46,7 +46,7 @@ def lines(found: Found, settings: Settings) -> list[str]:
     claim, about = found.claim, (conditions(found, settings), f"{tests(found)} {powered(found)}")
     command = (
         f"Made by `python -m research page {claim.name}{flags(settings)}` ({claim.digest}); "
-        f"figures: `data/{claim.name}.csv`."
+        f"`data/{claim.name}.csv`."
     )
     rows, same = table(found)
     return [

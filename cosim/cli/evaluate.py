@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import json
 import shlex
 import sys
@@ -82,8 +83,9 @@ def work(args: argparse.Namespace) -> int:
 
     if args.out is None and (continued(args) or not args.dry_run):
         raise BadInput("name the run's folder", field="--out")
+    named = functools.partial(check, field="policy", file=args.spec) if _in_spec(args) else check
     with Progress("evaluate: checking files", "MB") as checking, watched(checking):
-        plan = matrix.plan(*asked(args), check)
+        plan = matrix.plan(*asked(args), named)
     if not args.resume:
         matrix.check_names(plan)
     engine = engine_of(args)
@@ -91,6 +93,11 @@ def work(args: argparse.Namespace) -> int:
         return _dry_run(plan, engine, args)
     with opened(plan, args, execution.begin_or_resume) as (store, folder):
         return _drive(plan, engine, store, folder, args)
+
+
+def _in_spec(args: argparse.Namespace) -> bool:
+    """Whether the policies are those of a spec, not of the command line."""
+    return args.spec is not None and not args.policy
 
 
 def continued(args: argparse.Namespace) -> bool:

@@ -22,17 +22,17 @@ NAMES = tuple(agents.POLICIES)  # of shipped policies
 TRAINABLE = agents.TRAINABLE  # policies for `cosim train NAME`
 
 
-def check(text: str, field: str = "--policy") -> None:
+def check(text: str, field: str = "--policy", file: object = None) -> None:
     """Raises BadInput for an unknown policy, naming the nearest one or the fault of its file.
 
-    `field`: the option or field with the policy's name.
+    `field`: the option or field with the policy's name, in `file`.
     """
     try:
         _check(text)
     except BadInput as error:
         if error.field != "--policy":
             raise
-        raise BadInput(error.problem, file=error.file, field=field, value=error.value) from None
+        raise BadInput(error.problem, file=error.file or file, field=field, value=error.value) from None
 
 
 def _check(text: str) -> None:

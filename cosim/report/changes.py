@@ -60,8 +60,8 @@ def changes(figures: Mapping[str, PairedFigure]) -> Changes:
 def tone(figure: PairedFigure) -> str:
     """Whether a difference is good or bad; "" if it can be due to chance.
 
-    It can if there are fewer than FEWEST pairs, if the interval contains 0, or if McNemar's exact p of a rate is 5 % or more: with few crashes
-    Tango's interval may exclude 0 although the exact test is not significant.
+    It can with fewer than FEWEST pairs, if the interval contains 0, or if McNemar's exact p of a rate is 5 %
+    or more: with few crashes Tango's interval may exclude 0 although the exact test is not significant.
     """
     d = figure.difference
     chance = figure.n < FEWEST or math.isnan(d.low) or d.low <= 0.0 <= d.high

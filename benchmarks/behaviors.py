@@ -25,7 +25,7 @@ from benchmarks.lane_changes import CLASSES, Traffic, build_highway, measure
 from benchmarks.tables import markdown_row
 from cosim.report.statistics import NA, Figure, quantile, rate, share
 from cosim.scenario.behaviors import LC2013, MIXED, MOBIL, Behaviors, load_behaviors
-from cosim.seeding import FIRST_TEST_SEED, TUNING_SEEDS
+from cosim.seeding import FIRST_EXAMPLE_SEED, TUNING_SEEDS
 from sumo_scenarios import BEHAVIORS
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results" / "behaviors.md"
@@ -178,7 +178,7 @@ def report(folder: Path, scale: float) -> str:
 
     def collect(behavior: str, model: str, used: Behaviors) -> Traffic:
         total = Traffic()
-        for seed in (FIRST_TEST_SEED, FIRST_TEST_SEED + 1):
+        for seed in (FIRST_EXAMPLE_SEED, FIRST_EXAMPLE_SEED + 1):
             total.add(measure(folder, behavior, model, seed, scale * REPORT_DURATION[behavior], used))
         return total
 

@@ -29,7 +29,7 @@ from cosim.report import crash_rate, run_folder, wording
 from cosim.report.figures import CRASHES, INCIDENCES, Row, weights
 from cosim.report.statistics import effective, pooled_rate
 from cosim.scenario.tilt import ALL, OTHER, SECOND, Tilt, shipped
-from cosim.seeding import FIRST_TEST_SEED, TUNING_SEEDS
+from cosim.seeding import FIRST_EXAMPLE_SEED, TUNING_SEEDS
 from cosim.workers.tasks import OK
 
 Array = npt.NDArray[np.float64]
@@ -44,7 +44,7 @@ PAGE = Path("docs/results/estimate.md")
 INTERVALS = 400
 REAL = ("exit", "contested", "stress")  # scenario, demand, errors: AV crashes within reach of brute force
 REAL_TILT = Tilt({ALL: 3.0, ALL + OTHER: 2.0}, 2.0, 0.1)
-FRESH = FIRST_TEST_SEED + 10_000  # first seed for level `field`; results on earlier seeds were known
+FRESH = FIRST_EXAMPLE_SEED + 10_000  # first seed for level `field`; results on earlier seeds were known
 BRUTE, REPETITIONS, EACH = 1600, 40, 40  # episodes; estimates, and episodes per estimate
 UNSEEN = 0.5  # pseudo-crashes added to every case
 FIRST_WITH, FOLLOW_WITH = 1.0, 0.7  # as FIRST and FOLLOW, in rounds that evaluate crashes
@@ -156,7 +156,7 @@ def tune(world: str, demand: str, errors: str, runs: Path, episodes: Sequence[in
 def measure(runs: Path, worlds: Sequence[str], episodes: int, workers: int) -> None:
     """Drive the episodes of the page."""
     for name, tilt, count in (("brute", None, BRUTE), ("tilted", REAL_TILT, REPETITIONS * EACH)):
-        first = FIRST_TEST_SEED + (BRUTE if name == "tilted" else 0)
+        first = FIRST_EXAMPLE_SEED + (BRUTE if name == "tilted" else 0)
         drive(runs / name, *REAL, tilt, range(first, first + count), workers)
     for world in worlds:
         tilt = shipped(world)

@@ -119,7 +119,7 @@ class Windows(Hook):
             drive_on(episode, self.policy, began + after)
             if after == AFTER[0]:
                 yieldings = len(self.policy.served)
-                _yield(NEVER)
+                _begin("")  # what has begun goes on until it ends, with the needs exchanged or not
             figures = episode.result(self.policy.name).metrics
             due, mean = (figures[name].value for name in ("vehicles_due", "total_delay_s"))
             delays.append(math.nan if due is None or mean is None else round(due * mean, 1))
@@ -129,6 +129,11 @@ class Windows(Hook):
 def _yield(branch: str) -> None:
     """Turn on the habit of this branch alone."""
     on, Exchanged.on = BRANCHES[branch]
+    _begin(on)
+
+
+def _begin(on: str) -> None:
+    """AVs begin to yield by the habit of this constant alone; "": by none."""
     for constant in HABITS.values():
         setattr(yield_rule, constant, constant == on)
 
@@ -208,9 +213,9 @@ CONDITIONS = (
 WORDS = """# What do 100 s of yielding bring?
 
 Exact copies of one simulation differ in 100 s alone. In these, AVs follow one habit of
-[`yield-rule`](yielding.md) or never yield; before and afterwards the car drives alone. As a
-control, each AV eases off for vehicles that signal ahead of another AV. Change of the sum of all
-vehicles' delay, a window:
+[`yield-rule`](yielding.md) or never yield; before and afterwards the car drives alone; a
+yielding that has begun is ended. As a control, each AV eases off for vehicles that signal ahead of
+another AV. Change of the sum of all vehicles' delay, a window:
 
 {answer}
 

@@ -186,7 +186,7 @@ class Intervention:
 
     time: float  # s
     vehicle: str
-    reason: str  # one of `cosim.control.REASONS`
+    reason: str  # docs/reference/presets.md, Interventions
 
 
 ERROR_MEMORY = 5.0  # s after its end during which a human error still counts as involved in a collision
@@ -435,7 +435,7 @@ class History(NamedTuple):
     lane: npt.NDArray[np.int32]  # [R] each vehicle's lane (map-matched), newest frame; -1 unknown
     lane_position: Floats  # [R] m, front bumper along that lane
     pose: Floats  # [3] the ego's x m, y m, heading rad in the world, at the newest frame
-    target_speed: float  # m/s, the ego's present command (its speed while uncommanded)
+    target_speed: float  # m/s, the ego's present command (while uncommanded its speed, in `lawful` the limit)
     lane_changing: int  # +1 / -1 while a change to the left / right is under way, else 0
     route: RouteAhead  # lane centre lines ahead, dead ends, distance to the conflict zone
     time: float  # s
@@ -609,7 +609,8 @@ class Policy(Protocol):
         """Start an episode."""
 
     def decide(self, histories: Mapping[str, History]) -> dict[str, Decision]:
-        """One decision per AV to command; SUMO's IDM drives an AV without a decision."""
+        """One decision per AV to command; SUMO drives an AV without a decision: by IDM, in `lawful` after an
+        earlier decision by the car's Krauss driver."""
 
 
 LookAhead = Callable[[int], Sequence[Snapshot]]  # number of frames -> future snapshots (`Simulator.ahead`)
@@ -646,7 +647,10 @@ class Simulator(Protocol):
         """The remaining edges of the vehicle's route, its present edge first."""
 
     def commanded(self, vehicle: str) -> tuple[float | None, int]:
-        """Present target speed in m/s (None while uncommanded) and lane change under way (+1, 0, -1)."""
+        """Present target speed in m/s, and the lane change under way (+1, 0, -1).
+
+        While uncommanded the target is None, in `lawful` the speed limit.
+        """
 
     @property
     def tilted(self) -> tuple[float, Mapping[str, Sequence[float]]]:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import sumo_scenarios
 from cosim.batch import spec
-from cosim.errors import CosimError
+from cosim.errors import BadInput, CosimError
 from research import audit, drive, evaluate, index, kept, page, schema
 from research.drive import Settings
 from research.schema import Claim
@@ -77,8 +77,11 @@ def _check(claims: list[Claim], settings: Settings, args: argparse.Namespace) ->
     return STALE if lines else 0
 
 
-def _keep(claims: list[Claim], settings: Settings, _: argparse.Namespace) -> int:
-    """Keep the episodes of the claims in the repository."""
+def _keep(claims: list[Claim], settings: Settings, args: argparse.Namespace) -> int:
+    """Keep the episodes of all claims in the repository."""
+    part = args.names or settings.scenarios or (settings.scale, settings.seeds, settings.duration) != WHOLE
+    if part and settings.kept in (None, kept.FOLDER):
+        raise BadInput("would replace the kept episodes of all claims by a part: name another --kept folder")
     work = drive.planned(claims, settings)
     folder = settings.kept or kept.FOLDER
     with drive.opened(work, settings) as store:
@@ -96,6 +99,7 @@ def _audit(claims: list[Claim], settings: Settings, args: argparse.Namespace) ->
     return STALE if found.differing else 0
 
 
+WHOLE = Settings().scale, Settings().seeds, Settings().duration
 COMMANDS = {"list": _list, "drive": _drive, "page": _page, "check": _check, "keep": _keep, "audit": _audit}
 
 

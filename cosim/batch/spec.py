@@ -16,7 +16,7 @@ from cosim.files.xml_input import is_there
 from cosim.files.yaml_input import check_known, document, value_of
 from cosim.scenario import policy_name
 from cosim.scenario.options import FLEET, OPTIONS, EpisodeOptions, Option
-from cosim.seeding import FIRST_TEST_SEED
+from cosim.seeding import FIRST_EXAMPLE_SEED
 
 MAX_SEED = 2**62
 MAX_EPISODES = 1_000_000  # a larger number is probably a typing error: 3 GB of rows
@@ -69,7 +69,7 @@ def read(path: Path | None, flags: Mapping[str, Any]) -> Spec:
     if "what" not in values:
         known = ", ".join(sumo_scenarios.names())
         raise BadInput(f"name at least one: {known}, a folder or a .sumocfg", file=source, field="scenario")
-    first = (FIRST_TEST_SEED, FIRST_TEST_SEED + 1)
+    first = (FIRST_EXAMPLE_SEED, FIRST_EXAMPLE_SEED + 1)
     return _checked(Spec(values, first if span is None else seeds(span[0], *span[2:])), source)
 
 

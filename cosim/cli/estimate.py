@@ -4,6 +4,7 @@ import argparse
 import json
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 from cosim.cli import arguments, evaluate
 from cosim.errors import BadInput
@@ -49,6 +50,7 @@ def work(args: argparse.Namespace) -> int:
     Raises BadInput before the first episode, or CosimError when the run cannot continue.
     """
     from cosim.batch import execution, matrix
+    from cosim.files.yaml_input import document
     from cosim.policies import check
     from cosim.report import crash_rate, wording
     from cosim.report.summary import groups
@@ -64,7 +66,8 @@ def work(args: argparse.Namespace) -> int:
     if args.episodes is not None:
         seeds = range(seeds.start, seeds.start + args.episodes)
     if not go_on:
-        cases = [_as_asked(case, args) for case in cases]
+        named = args.errors or (args.spec and document(Path(args.spec)).get("errors") is not None)
+        cases = [_as_asked(case if named else replace(case, errors=FIELD), args) for case in cases]
     plan = matrix.plan(cases, seeds, check)
     if not args.resume:
         matrix.check_names(plan)
@@ -85,10 +88,9 @@ def work(args: argparse.Namespace) -> int:
 
 
 def _as_asked(case: EpisodeOptions, args: argparse.Namespace) -> EpisodeOptions:
-    """The case with errors of `FIELD` by default, and the tilt. Raises BadInput."""
+    """The case with the tilt. Raises BadInput."""
     from cosim.scenario import tilt
 
-    case = case if args.errors else replace(case, errors=case.errors or FIELD)
     if args.tilt == "none" or case.errors is None:
         return case
     if args.tilt is not None:

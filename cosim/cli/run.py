@@ -20,7 +20,7 @@ from cosim.errors import BadInput, SimulationTimeout, extra
 from cosim.scenario import Scenario, with_preset
 from cosim.scenario.options import EpisodeOptions, of_flags
 from cosim.scenario.policy_name import label, read
-from cosim.seeding import FIRST_TEST_SEED
+from cosim.seeding import FIRST_EXAMPLE_SEED
 from cosim.types import EpisodeResult
 from cosim.workers.worker import Worker
 
@@ -44,7 +44,7 @@ def add(commands: arguments.SubCommands) -> None:
     )
     arguments.options(run, without=("scenario",))
     arguments.add(run, "--out")
-    arguments.add(run, "--seed", default=FIRST_TEST_SEED, help=f"default {FIRST_TEST_SEED}")
+    arguments.add(run, "--seed", default=FIRST_EXAMPLE_SEED, help=f"default {FIRST_EXAMPLE_SEED}")
     run.add_argument(
         "--beside",
         metavar="POLICY",

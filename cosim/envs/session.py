@@ -167,9 +167,9 @@ setattr(open, "__signature__", _own.replace(parameters=[*[*_own.parameters.value
 class Session(contextlib.AbstractContextManager["Session"]):
     """One scenario in a supervised process, made by `cosim.open`. Several sessions can be open at once.
 
-    SUMO's IDM drives an AV without an action, even if the AV was commanded before. When the process ends, the
-    next call raises SimulationCrashed, and `reset` starts a fresh process. Use a session in a `with`
-    statement, or close it.
+    SUMO drives an AV without an action: by IDM, or in `lawful` after an earlier action by the car's Krauss
+    driver. When the process ends, the next call raises SimulationCrashed, and `reset` starts a fresh process.
+    Use a session in a `with` statement, or close it.
     """
 
     def __init__(self, scenario: Scenario, connect: Callable[[], Caller], seed: int | None = None) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from cosim.control import courtesy
 from cosim.episode import Episode, Step, run_episode
 from cosim.host import Earnings, Host, Hosts
 from cosim.metrics import MetricFactory
@@ -60,6 +61,7 @@ class Rollout(Hosts):
     def run(self, drive: Drive, progress: Any = None) -> DriveResult:
         """One whole episode; with a user's metrics every figure is logged."""
         episode, agent = self.episode(drive.lesson, drive.errors, drive.preset), self.agent
+        episode.simulator.courtesy = courtesy(drive.svo)
         self._weights("vfn", agent.vfn, drive.weights)
         self._weights("frozen", agent.frozen, drive.frozen)
         return drive_episode(episode, agent, drive, self._reward, progress, every=bool(self._metrics))
@@ -102,7 +104,8 @@ class Payments(Earnings):
         """One decision."""
         terms = self.pay(step, tuple(step.decisions))
         self.totals += [t.total for t in terms.values()]
-        crashed = frozenset(v for c in step.events.collisions for v in (c.collider, c.victim))
+        hits = [c for c in step.events.collisions if not c.insertion]
+        crashed = frozenset(v for c in hits for v in (c.collider, c.victim))
         self._agent.pay(terms, crashed, frozenset(episode.histories))
 
 

@@ -98,7 +98,7 @@ class StopLines(AvCounts):
         foes = {foe for foe, _ in entry.foes}
         for c in now.events.collisions:
             pair = {c.collider, c.victim}
-            if c.time >= entry.time and entry.vehicle in pair and pair & foes:
+            if not c.insertion and c.time >= entry.time and entry.vehicle in pair and pair & foes:
                 self._way += 1
                 self._tell(entry, now.time, f"touched {min(pair & foes)}, who had the right of way")
                 return False

@@ -30,7 +30,8 @@ class MissionSuccess:
         if not self._applies:
             return
         for collision in snapshot.events.collisions:  # they precede this frame's positions
-            self._crashed.update((collision.collider, collision.victim))
+            if not collision.insertion:
+                self._crashed.update((collision.collider, collision.victim))
         self._standing.difference_update(snapshot.events.arrived)
         if self._auto:  # its route may end before any goal lane
             self._reach(snapshot, self._reached.keys() & snapshot.events.arrived)

@@ -17,7 +17,8 @@ class Trips(AvCounts):
     def add(self, snapshot: Snapshot) -> None:
         super().add(snapshot)
         for collision in snapshot.events.collisions:
-            self._crashed.update((collision.collider, collision.victim))
+            if not collision.insertion:
+                self._crashed.update((collision.collider, collision.victim))
         if snapshot.events.arrived:
             self._completed.update(self._known.intersection(snapshot.events.arrived) - self._crashed)
         if snapshot.events.departed:

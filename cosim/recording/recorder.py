@@ -28,7 +28,7 @@ class Knowledge(NamedTuple):
     """An AV's knowledge besides the traffic at one decision, enough to rebuild its `History`."""
 
     route: tuple[str, ...] = ()  # edges still ahead, the present one first
-    target_speed: float | None = None  # m/s; None while SUMO drives it
+    target_speed: float | None = None  # m/s; None while SUMO drives it, in `lawful` the limit
     lane_changing: int = 0  # +1 left, -1 right
 
 

@@ -264,7 +264,7 @@ def _change(measure: Measure, rows: Sequence[Sequence[Row]], seed: int) -> Figur
 
 
 def _of_candidate(measure: Measure, rows: Sequence[Row], seed: int) -> tuple[Figure, str]:
-    """The figure of B over all its episodes, and its counts in words."""
+    """The figure of B over the episodes of all pairs, and its counts in words."""
     y = [value for value in measure.values(rows) if not math.isnan(value)]
     if measure.per:
         tally = measure.tally(rows)

@@ -146,7 +146,7 @@ def pair(a: Side, b: Side, across: Sequence[str] = ()) -> tuple[list[Group], tup
             _name(next(iter(rows.values())))
             for key, cells in of_side.items()
             for rows in cells.values()
-            if key not in of_other
+            if not any(rows.keys() & others.keys() for others in of_other.get(key, {}).values())
         ]
         for of_side, of_other in ((all_a, all_b), (all_b, all_a))
     )

@@ -25,7 +25,7 @@ from cosim.files.yaml_input import NonNegative, Positive, check_known, dataclass
 from cosim.scenario import human_errors, policy_name
 from cosim.scenario import sensing as sensing_levels
 from cosim.scenario.behaviors import DRIVER_MODELS, LC2013, load_behaviors
-from cosim.seeding import FIRST_TEST_SEED
+from cosim.seeding import FIRST_EXAMPLE_SEED
 from cosim.types import IDENTITY, OnCollision, Preset, Traffic
 
 if TYPE_CHECKING:
@@ -267,7 +267,7 @@ class EpisodeOptions:
         reader=code.absolute,
     )
     tilt: str | None = None  # of the errors (`cosim.scenario.tilt`), set by `cosim estimate`
-    seed: int = FIRST_TEST_SEED
+    seed: int = FIRST_EXAMPLE_SEED
 
     def __post_init__(self) -> None:
         for one in OPTIONS.values():

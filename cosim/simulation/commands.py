@@ -28,6 +28,7 @@ class Controlled:
     limit: float = math.inf  # m/s, of the law ahead
     lane_change: int = 0  # +1 left, -1 right, of the last lane change
     lane_change_until: float = -1.0  # s, the end of the last lane change
+    wanted_lane: str = ""  # of the last commanded lane change
     requested: float = -1.0  # m/s, the last speed sent to SUMO
     target_accel: float | None = None  # m/s2, replaces the target speed
 
@@ -83,6 +84,8 @@ class Commander:
         if refusal is not None:
             return Receipt(name, False, refusal)
         sumo.vehicle.changeLaneRelative(name, command.lane_offset, command.hold)
+        edge, _, index = lane.rpartition("_")
+        state.wanted_lane = f"{edge}_{int(index) + command.lane_offset}"
         self._record_lane_change(name, state, command.lane_offset, now)
         return Receipt(name, True)
 
@@ -128,7 +131,8 @@ class Commander:
             name, state = command.vehicle, self.controlled.get(command.vehicle)
             if not state or name not in sumo.vehicle.getIDList():
                 continue
-            if abs(sumo.vehicle.getLateralLanePosition(name)) < 0.05:
+            there = sumo.vehicle.getLaneID(name) == state.wanted_lane  # a file's changes may take no time
+            if not there and abs(sumo.vehicle.getLateralLanePosition(name)) < 0.05:
                 state.lane_change, state.lane_change_until = 0, -1.0
                 self.lane_changes.pop(name, None)
                 confirmed[k] = Receipt(name, False, f"refused by SUMO's lane-change safety ({self._preset})")

@@ -3,6 +3,7 @@
 import os
 import pickle
 import signal
+import traceback
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -32,6 +33,9 @@ def forked(work: Callable[[], Answer]) -> Answer:
                 answer = work()
             except CosimError as error:
                 answer = error
+            except BaseException:
+                traceback.print_exc()
+                raise
             with os.fdopen(theirs, "wb") as pipe:
                 pickle.dump(answer, pipe, pickle.HIGHEST_PROTOCOL)
             code = 0

@@ -86,7 +86,7 @@ class OnPolicyTrainer(Trainer):
         return self.config.a2c.keep
 
     def epsilon(self, k: int) -> float:
-        """0: all actions are drawn from the network's preferences."""
+        """1: all actions are drawn from the network's preferences."""
         return 1.0
 
     def learn_afterwards(self, k: int, drives: Sequence[Trajectory]) -> Metrics:

@@ -132,3 +132,14 @@ def test_another_demand_drives_where_the_files_own_is_missing(
     mine = str(tmp_path / "mine.rou.xml")
     assert drive(file, "--demand", mine, "--duration", "20")["vehicles_inserted"] > 3
     assert load(file, options=["--route-files", mine]).demand == (Path(mine),)
+
+
+def test_a_lane_change_that_takes_no_time_is_executed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "left.py").write_text(
+        "from cosim.types import MetaAction\ndef left(seen): return MetaAction.LANE_LEFT\n"
+    )
+    arguments = ["run", "highway", "--policy", f"{tmp_path}/left.py:left", "--preset", "guarded", "--json"]
+    assert main([*arguments, "--duration", "10", "--", "--lanechange.duration", "0"]) == 0
+    assert json.loads(capsys.readouterr().out)["lane_changes_commanded"] > 0

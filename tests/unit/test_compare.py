@@ -571,3 +571,17 @@ def test_the_mission_figures_of_two_guessed_vehicles_are_no_pair(tmp_path: Path)
     figures = compare(side(f"{folder}:idm"), side(f"{folder}:kind")).groups[0].figures
     assert (figures["dt_mission_m"].n, figures["dt_mission_m"].difference.value) == (2, 0.0)
     assert figures["dt_mean_m"].n == 3
+
+
+def test_a_cell_without_a_common_seed_is_listed_beside_those_with_one(tmp_path: Path) -> None:
+    merge, leave = CASE, replace(CASE, what="exit")
+    both = [
+        (replace(c, seed=200_000), row(replace(c, seed=200_000), scenario=c.what)) for c in (merge, leave)
+    ]
+    other = replace(leave, seed=200_009)
+    a = write(tmp_path / "a", both[:1], both[1:])
+    b = write(tmp_path / "b", both[:1], [(other, row(other, scenario="exit"))])
+    found = compare(side(str(a)), side(str(b)))
+    assert len(found.groups) == 1
+    assert [len(cells) for cells in found.unmatched] == [1, 1]
+    assert all("exit" in cells[0] for cells in found.unmatched)

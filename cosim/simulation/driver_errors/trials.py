@@ -95,11 +95,6 @@ class HumanErrors:
             self._ended[name] = min(found[1].error.until, sumo.simulation.getTime())
             self._drivers.resume(name)
 
-    def restore(self) -> None:
-        """End every active error now and restore the drivers."""
-        for name in [*self._under_way]:
-            self._end(name)
-
     def step(self, now: float) -> None:
         """After a simulation step that ended at `now` (s)."""
         for name, (kind, under_way) in [*self._under_way.items()]:

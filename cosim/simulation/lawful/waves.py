@@ -58,7 +58,7 @@ class Waves:
             sumo.vehicle.setParameter(av, LEADER_PARAMETER, ignored)
 
     def forget(self, av: str) -> None:
-        """The AV has left the road, or SUMO drives it again."""
+        """The AV has left the road."""
         for known in (self._unknown, self._file_leaders, self._ignored_leaders):
             known.pop(av, None)
 

@@ -637,11 +637,9 @@ class Simulator(Protocol):
     def advance(self, commands: Sequence[Command]) -> tuple[tuple[Receipt, ...], tuple[Snapshot, ...]]:
         """Hold the commands for one decision; one snapshot per frame, the newest last."""
 
-    def ahead(
-        self, frames: int, commands: Sequence[Command] = (), *, errors: bool = False
-    ) -> tuple[Snapshot, ...]:
+    def ahead(self, frames: int, commands: Sequence[Command] = ()) -> tuple[Snapshot, ...]:
         """A counterfactual rollout with the AVs' present commands, replaced by `commands` where given; the
-        simulation itself does not change. `errors`: whether new human errors may begin."""
+        simulation itself does not change. No new human errors begin."""
 
     def route(self, vehicle: str) -> tuple[str, ...]:
         """The remaining edges of the vehicle's route, its present edge first."""

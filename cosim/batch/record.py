@@ -2,7 +2,6 @@
 
 import hashlib
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -50,15 +49,7 @@ class RecordingRunner(EpisodeRunner):
         return document
 
 
-def record(
-    out: Path,
-    plan: Plan,
-    *,
-    workers: int = 1,
-    resume: bool = False,
-    command: Sequence[str] = (),
-    quiet: bool = False,
-) -> list[str]:
+def record(out: Path, plan: Plan, *, workers: int = 1, resume: bool = False) -> list[str]:
     """Record the plan's episodes in `out`; returns failed episodes with their reasons.
 
     Existing episodes are skipped with `resume`; without it they raise BadInput.
@@ -67,12 +58,12 @@ def record(
     if folder.manifest_file.is_file() and not resume:
         raise BadInput("holds recordings already (--resume continues them)", field="--out", value=str(out))
     folder.prepare()
-    document = _manifest(folder, plan, command)
+    document = _manifest(folder, plan)
     folder.write_manifest(document)
     todo = [cell.task(case) for cell, case in plan.cases() if not folder.has(case.key)]
     failed: dict[str, str | None] = {}
     outcomes = LocalEngine(RecordingRunner, (str(out),), workers=workers).run(todo)
-    for outcome in shown(outcomes, len(todo), "record", "episodes", quiet=quiet):
+    for outcome in shown(outcomes, len(todo), "record", "episodes"):
         if not outcome.ok:
             failed[outcome.key] = outcome.error
     document["failed"] = failed
@@ -81,7 +72,7 @@ def record(
     return [f"{key}: {why}" for key, why in failed.items()]
 
 
-def _manifest(folder: Folder, plan: Plan, command: Sequence[str]) -> dict[str, Any]:
+def _manifest(folder: Folder, plan: Plan) -> dict[str, Any]:
     """The sources of the recordings, merged with an earlier manifest. Raises BadInput when the files of a
     cell have changed since."""
     before: dict[str, Any] = folder.manifest() if folder.manifest_file.is_file() else {}
@@ -96,7 +87,7 @@ def _manifest(folder: Folder, plan: Plan, command: Sequence[str]) -> dict[str, A
     return {
         "cells": known,
         "seeds": sorted({*before.get("seeds", ()), *plan.seeds}),
-        "commands": [*before.get("commands", ()), list(command) or sys.argv[1:]],
+        "commands": [*before.get("commands", ()), sys.argv[1:]],
     }
 
 

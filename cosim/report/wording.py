@@ -81,7 +81,7 @@ def p_value(p: float) -> str:
     return "p < 0.001" if p < 0.001 else f"p {p:.2g}"
 
 
-def group(identity: Mapping[str, Any], *, policy: bool = True) -> str:
+def group(identity: Mapping[str, Any]) -> str:
     """`merge / contested / idm / moderate / unguarded / svo 45 / lc2013`."""
     forms = {
         "scenario": "{}",
@@ -95,7 +95,7 @@ def group(identity: Mapping[str, Any], *, policy: bool = True) -> str:
         "penetration": "penetration {:g}",
         "driver_model": "{}",
     }
-    known = {name: identity.get(name) for name in forms if policy or name != "policy"}
+    known = {name: identity.get(name) for name in forms}
     return " / ".join(forms[name].format(value) for name, value in known.items() if value is not None)
 
 

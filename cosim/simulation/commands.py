@@ -184,13 +184,6 @@ def return_to_sumo(name: str) -> None:
     sumo.vehicle.setLaneChangeMode(name, SUMO_LANE_CHANGE_MODE)
 
 
-def force(name: str, accel: float, step: float) -> None:
-    """Accelerate a vehicle by `accel` m/s2 for one step of `step` s, without any safety checks."""
-    sumo.vehicle.setSpeedMode(name, SPEED_MODE[Preset.UNGUARDED])
-    sumo.vehicle.setDecel(name, MAX_DECEL)
-    sumo.vehicle.setSpeed(name, max(sumo.vehicle.getSpeed(name) + max(accel, -MAX_DECEL) * step, 0.0))
-
-
 def _refusal(name: str, lane: str, offset: int) -> str | None:
     """Why the road forbids vehicle `name` on `lane` to change by `offset` lanes; None if it does not."""
     if not lane:

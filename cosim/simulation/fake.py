@@ -78,9 +78,7 @@ class FakeSimulator:
         receipts = tuple(self._take(c) for c in commands)
         return receipts, self._drive(round(self._timing.decision / self._timing.frame))
 
-    def ahead(
-        self, frames: int, commands: Sequence[Command] = (), *, errors: bool = False
-    ) -> tuple[Snapshot, ...]:
+    def ahead(self, frames: int, commands: Sequence[Command] = ()) -> tuple[Snapshot, ...]:
         """A counterfactual rollout; without driver errors."""
         other = copy.copy(self)
         other._vehicles, other._hit = copy.deepcopy(self._vehicles), set(self._hit)

@@ -8,7 +8,6 @@ from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import libsumo
@@ -30,7 +29,7 @@ from cosim.seeding import uniform
 from cosim.sensing.perception import Perception
 from cosim.simulation.backend import sumo
 from cosim.simulation.collisions import CollisionDetector, Wrecks
-from cosim.simulation.commands import Commander, force
+from cosim.simulation.commands import Commander
 from cosim.simulation.convert import Body, SnapshotReader, read_road, struggling_lanes
 from cosim.simulation.derived_types import drivers
 from cosim.simulation.driver_errors.trials import HumanErrors
@@ -70,7 +69,6 @@ WRONG_DEMAND = re.compile(
 NO_FILES = {"device.ssm.file": NOWHERE}  # a vType with this device would write a file per vehicle
 GIVES_UP = "max-depart-delay"  # SUMO drops vehicles that waited longer, without a message
 DERIVED = "types.add.xml"  # file of the derived vTypes
-NO_FORCED: Mapping[str, float] = MappingProxyType({})
 
 _in_use = False
 
@@ -203,34 +201,21 @@ class SumoSimulator:
         self._acting = commands
         self._receipts = tuple(self._commander.take(c, now) for c in commands)
 
-    def _drive(
-        self, steps: int, forced: Mapping[str, float] = NO_FORCED, *, driven: int = 0
-    ) -> tuple[Snapshot, ...]:
-        """Advance; one snapshot per frame. `forced`: see `ahead`; `driven`: steps since the decision."""
+    def _drive(self, steps: int, *, driven: int = 0) -> tuple[Snapshot, ...]:
+        """Advance; one snapshot per frame. `driven`: steps since the decision."""
         frames = []
         for k in range(driven + 1, driven + steps + 1):
             self._commander.drive()
-            if forced:
-                for name in forced.keys() & set(sumo.vehicle.getIDList()):
-                    force(name, forced[name], self._scenario.timing.step)
             self._step()
             if k % self._steps_per_frame == 0:
                 frames.append(self._snapshot())
         return tuple(frames)
 
-    def ahead(
-        self,
-        frames: int,
-        commands: Sequence[Command] = (),
-        *,
-        errors: bool = False,
-        forced: Mapping[str, float] = NO_FORCED,
-    ) -> tuple[Snapshot, ...]:
+    def ahead(self, frames: int, commands: Sequence[Command] = ()) -> tuple[Snapshot, ...]:
         """A counterfactual rollout of `frames` frames: the present commands hold, except for `commands`.
 
         SUMO continues in a copy of this process (`cosim.simulation.fork`); this process does not change.
-        `errors`: whether new human errors may begin; active ones continue. `forced`: AV -> acceleration in
-        m/s2 (down to -`MAX_DECEL`), which overrides commands and car-following model.
+        Active human errors continue, no new ones begin.
 
         Raises SimulationError. Raises BadInput if the copy would also write SUMO's outputs, or talk to other
         TraCI clients.
@@ -238,19 +223,17 @@ class SumoSimulator:
         if self._outputs or self._SHARED:
             why = "other programs share it" if self._SHARED else "SUMO writes outputs of its own"
             raise BadInput(f"rollouts are impossible in this simulation: {why}", file=self._scenario.config)
-        return forked(partial(self._drive_on, frames, commands, errors, forced))
+        return forked(partial(self._drive_on, frames, commands))
 
-    def _drive_on(
-        self, frames: int, commands: Sequence[Command], errors: bool, forced: Mapping[str, float]
-    ) -> tuple[Snapshot, ...]:
+    def _drive_on(self, frames: int, commands: Sequence[Command]) -> tuple[Snapshot, ...]:
         """The rollout, in the copy of the process."""
-        if self._errors is not None and not errors:
+        if self._errors is not None:
             self._errors.hold()
         with self._stderr:
             now = sumo.simulation.getTime()
             for command in commands:
                 self._commander.take(command, now)
-            return self._drive(frames * self._steps_per_frame, forced)
+            return self._drive(frames * self._steps_per_frame)
 
     def route(self, vehicle: str) -> tuple[str, ...]:
         """The remaining edges of the route, the present one first."""

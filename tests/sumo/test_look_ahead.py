@@ -82,23 +82,6 @@ class Looking:
         host.close()
         return hashes, worst, looks
 
-    def brake(self) -> tuple[float, float]:
-        """m/s that an AV at speed loses within 1 s of forced hard braking; trace hash aside."""
-        host = Host(load("merge", demand=["contested"]), Keeps(False), 0.0)
-        host.episode.start(150_000)
-        before = host.episode.snapshot
-        av = max(before.avs, key=lambda name: before.speed[before.row[name]])
-        after = host.simulator.ahead(5, forced={av: -20.0})[-1]  # type: ignore[call-arg]
-        host.close()
-        return float(before.speed[before.row[av]]), float(after.speed[after.row[av]])
-
-
-def test_a_forced_av_brakes_as_hard_as_it_can() -> None:
-    with Worker(Looking) as worker:
-        before, after = worker.call("brake")
-    assert before > 10.0
-    assert before - after == pytest.approx(8.0, abs=0.2), "m/s within 1 s, at MAX_DECEL"
-
 
 @pytest.mark.parametrize("errors", [None, "stress"])
 def test_looking_ahead_tells_what_comes_and_changes_nothing(errors: str | None) -> None:

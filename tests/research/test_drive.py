@@ -242,3 +242,9 @@ def test_the_kept_episodes_of_the_repository_are_those_of_its_pages(monkeypatch:
     assert found.unknown == 0, (
         "weights or scenarios are new: `python -m research drive`, then `page` and `keep`"
     )
+
+
+def test_a_part_does_not_replace_the_kept_episodes_of_all(capsys: pytest.CaptureFixture[str]) -> None:
+    for part in (["altruism"], ["--scale", "0.5"], ["--seeds", "300000:300002"], ["--scenario", "merge"]):
+        assert cli.main(["keep", *part]) == 2
+        assert "would replace the kept episodes" in capsys.readouterr().err

@@ -146,3 +146,13 @@ def test_bad_input_leaves_nothing(
     assert run(f"estimate --scenario merge {flags} --errors stress --out {out}") == 2
     assert said in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_a_spec_without_errors_is_estimated_without_errors(tmp_path: Path) -> None:
+    spec = tmp_path / "none.yaml"
+    spec.write_text(
+        "scenario: merge\ndemand: free\npolicy: idm\nduration: 4\nwarmup: 4\nerrors: none\n"
+        'seeds: "140000:140002"\n'
+    )
+    assert run(f"estimate {spec} --workers 1 --out {tmp_path}/out") == 0
+    assert {row["errors"] for row in rows(tmp_path / "out")} == {None}

@@ -330,6 +330,7 @@ class _Slots:
             if np.isnan(self.tracks[:, k, kernels.T_TIME]).all():
                 self.names[k] = ""
                 del self.place[name]
+                self._clear(k)
         new = [name for name in s.ids if name not in self.place]
         free = [k for k, name in enumerate(self.names) if not name]
         while len(free) < len(new):
@@ -362,6 +363,9 @@ class _Slots:
         kind = s.kind[row]
         self.equipped[k] = kind == Kind.AV or (kind == Kind.HV and is_equipped(name))
         self.streams[k] = stream(name)
+
+    def _clear(self, k: int) -> None:
+        """Forget a slot's object, and the messages about it that are under way."""
         self.ring[:, k] = np.nan
         self.seen[:, :, k] = 0
         self.past[:, :, k] = np.nan

@@ -538,3 +538,20 @@ def test_ideal_sensing_is_called_as_before() -> None:
     assert load("merge").identity("idm", None, 45.0, 3).sensing is None
     assert load("merge", sensing="v2v,delay=1").identity("idm", None, 45.0, 3).sensing == "v2v,delay=1"
     assert "sensing" not in manifest(load("merge"), 3)
+
+
+def test_a_message_about_a_vehicle_that_has_left_the_road_is_lost_when_nobody_tracks_it() -> None:
+    cars = [EGO, Car("far", 400.0, kind=Kind.AV), Car("h", 470.0, speed=10.0, leaves=1.6)]
+    cars.append(Car("z", -300.0, leaves=2.2))  # slots are freed when the vehicles on the road change
+    late: dict[str, Any] = {"range": 60.0, "cpm": True, "cam": True, "delay": 2.0, "forget": 0.4}
+    told = seen = 0
+    for _, percepts in drive(cars, 30, **late, message_range=1000.0):
+        for av, percept in percepts.items():
+            ids = percept.world.ids
+            assert av in ids
+            assert len(set(ids)) == len(ids)
+            assert set(ids) <= ({"ego", "far"} if av == "ego" else {"ego", "far", "h"})
+            told += "far" in ids and av == "ego"
+            seen += "h" in ids
+    assert told > 0
+    assert seen > 0

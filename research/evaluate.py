@@ -33,7 +33,7 @@ from research.drive import PART, Arm, Arms, policy, pooled
 from research.schema import Claim, Condition
 
 SIGNIFICANT = 0.05  # level for p, which is corrected for all tests of the claim
-Verdict = Literal["yes", "no", "not resolved"]
+Verdict = Literal["yes", "no", "unresolved"]
 
 
 class Line(NamedTuple):
@@ -100,7 +100,7 @@ class Found:
         other: Verdict = "yes" if decisive == "no" else "no"
         if decisive in verdicts:
             return decisive
-        return other if verdicts == {other} else "not resolved"
+        return other if verdicts == {other} else "unresolved"
 
     @property
     def overall(self) -> dict[str, PairedFigure]:
@@ -274,11 +274,11 @@ def _verdict(claim: Claim, one: PairedFigure, most: float, p: float) -> Verdict:
     """
     difference, sign = one.difference, claim.primary.sign
     if not difference.known:
-        return "not resolved"
+        return "unresolved"
     if p < SIGNIFICANT and min(sign * difference.low, sign * difference.high) > 0.0:
         return "yes"
     room = math.inf
     if one.measure.is_rate:
         room = 1.0 - one.a.value if sign > 0.0 else one.a.value
     possible = claim.power.smallest <= room or most < 0.0
-    return "no" if most < claim.power.smallest and possible else "not resolved"
+    return "no" if most < claim.power.smallest and possible else "unresolved"

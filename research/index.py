@@ -18,9 +18,9 @@ INDEX = """\
 # What the papers claimed, and what we found
 
 P: Valiente et al., prediction-aware cooperative driving. T: Toghi et al., altruistic maneuver planning.
-Both simulate with HighwayEnv, we with SUMO; scenarios and demands are ours. Every line is written by
-`python -m research page` from `research/claims/`. A verdict comes with its counts over conditions and with
-the paired differences to the arms that are named.
+Both simulate with HighwayEnv, we with SUMO; scenarios and demands are ours. Lines are written by
+`python -m research page`. A verdict comes with its counts over conditions and with paired differences to
+the arms that are named.
 
 | claim | source | must hold | verdict | page |
 |---|---|---|---|---|

@@ -27,7 +27,7 @@ WIDTH = 100  # columns of prose
 COLUMNS = {"n": "", "preset": "preset", "errors": "errors", "sensing": "sensing", "drivers": "behavior"}
 COLUMNS |= {"weights": ""}
 TESTS = {"mcnemar": "McNemar's exact test", "signed_rank": "Wilcoxon's signed ranks"}
-WORDS = {"yes": "Yes.", "no": "No.", "not resolved": "Not resolved."}
+WORDS = {"yes": "Yes.", "no": "No.", "unresolved": "Unresolved."}
 
 
 def write(found: Found, settings: Settings, out: Path) -> Path:

@@ -87,7 +87,7 @@ class Claim:
     """
 
     name: str  # of the file, the page and the CSV
-    sentence: str  # the claim; the page answers yes, no or not resolved
+    sentence: str  # the claim; the page answers yes, no or unresolved
     source: str  # paper and figure
     scenarios: tuple[str, ...]
     seeds: Seeds

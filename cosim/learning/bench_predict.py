@@ -201,7 +201,6 @@ def markdown(
         "with 95 % bootstrap intervals over episodes; scenarios have equal weight. The predictors know",
         f"the last 2 s of a vehicle. `{LANE_PREDICTOR}` also knows the road: it moves `gp-indirect`'s speeds",
         "along the lanes.",
-        "The CSV files hold the rows by scenario and kind of driver.",
     ]
     return "\n".join(lines + (["", "```", command, "```"] if command else [])) + "\n"
 

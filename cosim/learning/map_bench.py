@@ -192,7 +192,7 @@ def markdown(table: Sequence[Mapping[str, Any]], compared: Sequence[Mapping[str,
         "",
         f"{total[0]['episodes']} episodes, {total[0]['n']:,} samples (an AV at a decision, one in {STRIDE}).",
         "PRE is the mean squared error per pixel of the vehicle channels, IoU the overlap of occupied",
-        "pixels. Intervals are 95 % over episodes. The CSV files hold the rows by scenario.",
+        "pixels. Intervals are 95 % over episodes.",
     ]
     return "\n".join(lines) + "\n"
 
@@ -205,7 +205,7 @@ def _verdict(compared: Sequence[Mapping[str, Any]]) -> list[str]:
         return ["Change by the HPN, mean over the horizons:"]
     better = row["pre_high"] < 0.0 < row["iou_low"]
     change = statistics.Figure(row["pre_change"], row["pre_low"], row["pre_high"]).text(1, 100.0)
-    answer = "**Yes.**" if better else "**Not resolved.**"
+    answer = "**Yes.**" if better else "**Unresolved.**"
     return [
         f"Are the maps of the HPN better than maps drawn from the kinematic forecast (`{FORECAST}`)?",
         f"{answer} The squared error changes by {change} %.",

@@ -32,7 +32,7 @@ class Speeding:
         self._worst = max(self._worst, worst)
 
     def result(self) -> dict[str, Metric]:
-        share, worst = (self._above / self._frames, round(self._worst, 6)) if self._frames else (None, None)
+        share, worst = (self._above / self._frames, self._worst) if self._frames else (None, None)
         return {
             "speeding_share": Metric(share, "share of vehicle time", "lower"),
             "worst_speeding_mps": Metric(worst, "m/s", "lower"),

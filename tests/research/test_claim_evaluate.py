@@ -51,8 +51,8 @@ def test_one_condition_without_an_effect_of_interest_makes_it_no(tmp_path: Path)
 
 def test_too_few_episodes_resolve_nothing_and_say_which_power_they_had(tmp_path: Path) -> None:
     one = found(tmp_path, SAVES, FEW)
-    assert [t.verdict for t in one.tested] == ["yes", "not resolved"]
-    assert one.verdict == "not resolved"
+    assert [t.verdict for t in one.tested] == ["yes", "unresolved"]
+    assert one.verdict == "unresolved"
     assert one.tested[1].power < 0.3
     assert one.tested[0].power > 0.95
 
@@ -64,14 +64,14 @@ def test_an_effect_the_other_way_is_no(tmp_path: Path) -> None:
 
 def test_more_tests_need_a_narrower_interval_for_no(tmp_path: Path) -> None:
     same = (rows(range(10), 45), rows(range(1, 11), 45))
-    assert found(tmp_path, same, same).tested[0].verdict == "not resolved"
+    assert found(tmp_path, same, same).tested[0].verdict == "unresolved"
     alone = {key: arm for key, arm in found(tmp_path, same, same).arms.items() if key[0].scenario == "merge"}
     assert evaluate(claim(tmp_path), alone, NOTES).verdict == "no"
 
 
 def test_a_share_without_room_for_the_effect_cannot_say_no_but_its_opposite_can(tmp_path: Path) -> None:
     clean = (rows([], 400), rows([], 400))
-    assert {t.verdict for t in found(tmp_path, clean, clean).tested} == {"not resolved"}
+    assert {t.verdict for t in found(tmp_path, clean, clean).tested} == {"unresolved"}
     assert {t.verdict for t in found(tmp_path, SAVES[::-1], SAVES[::-1]).tested} == {"no"}
 
 
@@ -125,7 +125,7 @@ def test_ranks_alone_do_not_make_it_yes_if_the_mean_may_be_nothing(tmp_path: Pat
     one = found(tmp_path, (after, before), (after, before), **changes).tested[0]
     assert one.p_holm < 0.05
     assert one.found.difference.low < 0.0 < one.found.difference.value
-    assert one.verdict == "not resolved"
+    assert one.verdict == "unresolved"
 
 
 def test_the_pooled_interval_counts_traffic_once_that_two_conditions_share(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""A page says yes, no or not resolved first, and shows what it rests on."""
+"""A page says yes, no or unresolved first, and shows what it rests on."""
 
 from __future__ import annotations
 

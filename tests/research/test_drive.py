@@ -107,7 +107,7 @@ def test_every_claim_is_driven_and_written_in_small(tmp_path: Path) -> None:
     assert cli.main(["drive", *flags]) == 0
     assert cli.main(["page", *flags]) == 0
     index_of = (tmp_path / "pages" / "README.md").read_text()
-    assert index_of.count("**Not resolved.**") == len([*chosen([])])
+    assert index_of.count("**Unresolved.**") == len([*chosen([])])
     assert cli.main(["check", *flags]) == 0
 
 

@@ -19,7 +19,12 @@ from research.evaluate import Found
 from research.schema import Condition
 
 TICKS = (0.0, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # %
-STYLE: Any = {"svg.fonttype": "none", "svg.hashsalt": "cosim", "font.size": 9.0}  # equal figures, equal file
+STYLE: Any = {  # equal figures, equal file
+    "svg.fonttype": "none",
+    "svg.hashsalt": "cosim",
+    "font.size": 9.0,
+    "font.sans-serif": ["DejaVu Sans"],  # not all that matplotlib knows, in every text
+}
 CLIP = re.compile(r"\bp[0-9a-f]{10}\b")  # hash of a clip's exact size, whose last bits depend on the machine
 FINE = re.compile(r"\b\d+\.\d{3,}\b")  # a coordinate, in hundredths of a point and finer
 

@@ -213,9 +213,9 @@ CONDITIONS = (
 WORDS = """# What do 100 s of yielding bring?
 
 Exact copies of one simulation differ in 100 s alone. In these, AVs follow one habit of
-[`yield-rule`](yielding.md) or never yield; before and afterwards the car drives alone; a
-yielding that has begun is ended. As a control, each AV eases off for vehicles that signal ahead of
-another AV. Change of the sum of all vehicles' delay, a window:
+[`yield-rule`](yielding.md) or never yield; before and afterwards the car drives alone. A
+yielding under way then goes on to its end. As a control, each AV eases off for vehicles that signal
+ahead of another AV. Change of the sum of all vehicles' delay, a window:
 
 {answer}
 

@@ -5,7 +5,7 @@ import textwrap
 from collections import Counter
 from collections.abc import Iterable, Sequence
 
-from cosim.report.result import EVERYBODY, LAW, NEAR_MISSES, figure
+from cosim.report.result import EVERYBODY, LAW, NEAR_MISSES, NOISE, figure
 from cosim.scenario.policy_name import label
 from cosim.scenario.traffic import CHECKS_INSIDE, in_words
 from cosim.types import INSIDE, Collision, EpisodeResult, HumanError, Metric
@@ -174,7 +174,7 @@ def _table(episodes: Sequence[EpisodeResult], every: bool) -> list[str]:
     rows, zero = [], []
     for name in names:
         found = [metrics[name] for metrics in known if name in metrics]
-        values = [metric.value for metric in found]
+        values = [None if metric.value is None else abs(metric.value) > NOISE for metric in found]
         if all(value is None for value in values):
             continue
         if name not in ROWS or name in ALWAYS_SHOWN or any(values) or found[0].better == "higher":

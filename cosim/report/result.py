@@ -7,6 +7,7 @@ from pathlib import Path
 from cosim.files import cannot, whole
 from cosim.types import EpisodeResult, Metric
 
+NOISE = 1e-9  # in a figure's own unit: less is the rounding of a sum
 # Figures of all vehicles that were due to depart (figures.md, Everybody), in words.
 EVERYBODY = {
     "total_delay_s": "delay of all",
@@ -66,5 +67,7 @@ def figure(metric: Metric) -> str:
         return "NA"
     if isinstance(value, bool):
         return "yes" if value else "no"
+    if abs(value) < NOISE:
+        value = 0
     shown = f"{value:.3g}" if isinstance(value, float) and abs(value) < 100 else f"{value:.0f}"
     return f"{shown} {metric.unit}".rstrip()

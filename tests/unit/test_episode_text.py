@@ -124,7 +124,7 @@ def test_no_line_is_too_long(every: bool) -> None:
 
 def test_rounding_is_nothing_and_a_distance_of_nothing_is_shown() -> None:
     result = driven("idm", worst_speeding_mps=7.1e-15, min_ttc_s=0.0, uncounted_overlaps=1)
-    result.metrics["min_ttc_s"] = Metric(0.0, "s", "higher")  # type: ignore[index]
+    result.metrics["min_ttc_s"] = Metric(0.0, "s", "higher")
     lines = text(result).splitlines()
     assert not [line for line in lines if "worst_speeding" in line or "e-15" in line]
     assert [line.split()[-2:] for line in lines if "min_ttc_s" in line] == [["0", "min_ttc_s"]]

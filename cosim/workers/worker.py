@@ -73,6 +73,10 @@ class Worker(contextlib.AbstractContextManager["Worker"]):
         try:
             with _one_blas_thread(), _script_left_out(factory, arguments):
                 self._process.start()
+        except BaseException:
+            self._pipe.close()
+            self._remove_files()
+            raise
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
         theirs.close()
@@ -118,6 +122,9 @@ class Worker(contextlib.AbstractContextManager["Worker"]):
             self._process.join()
         self._process.close()  # frees its descriptors now, not when the garbage collector comes
         self._pipe.close()
+        self._remove_files()
+
+    def _remove_files(self) -> None:
         self._stderr.close()
         shutil.rmtree(self._folder, ignore_errors=True)  # also what a killed simulation has left
 

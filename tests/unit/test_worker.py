@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import signal
 import sys
 import tempfile
@@ -204,13 +205,19 @@ def test_the_temporary_files_of_a_killed_process_are_deleted() -> None:
 
 def test_a_process_whose_caller_is_killed_deletes_its_files() -> None:
     worker = Worker(Served)
-    folder, pid = worker._folder, worker.pid
     worker._pipe.close()  # as the end of the caller does
-    deadline = time.monotonic() + 20.0
-    while not gone(pid) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert not folder.exists()
+    worker._process.join(20.0)
+    assert not worker._folder.exists()
     worker.close()
+
+
+def test_a_factory_that_another_process_cannot_get_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with pytest.raises((AttributeError, pickle.PicklingError)):
+        Worker(lambda: None)
+    assert not [*tmp_path.iterdir()]
 
 
 def test_two_workers_are_two_processes(worker: Worker) -> None:

@@ -223,7 +223,7 @@ ahead of another AV. Change of the sum of all vehicles' delay, a window:
 
 {table}
 
-Brackets hold 95 % intervals over roads.
+Brackets hold 95 % intervals over roads. Windows without a yielding are left out.
 
 {conditions}
 

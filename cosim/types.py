@@ -135,6 +135,11 @@ class Collision:
         return self.kind == INSERTION
 
     @property
+    def vehicles(self) -> tuple[str, ...]:
+        """The vehicles (or persons) for which it counts."""
+        return () if self.insertion else (self.collider, self.victim)
+
+    @property
     def involves_av(self) -> bool:
         return not self.insertion and (self.collider_is_av or self.victim_is_av)
 

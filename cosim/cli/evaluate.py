@@ -196,16 +196,17 @@ class Driven:
     def text(self, plan: Plan, folder: Path) -> str:
         """Numbers of episodes, rate and statuses."""
         from cosim.report.summary import not_comparable, reasons
+        from cosim.report.wording import counted
 
         now = plan.episodes - self.done
         unfit = reasons([row for row in self.rows if not_comparable(row)])
         status = {**self.summary["status"], "not driven": plan.episodes - len(self.rows)}
         return (
-            f"{_count(plan.episodes, 'episode')} of {_count(len(plan.cells), 'cell')} in {folder}\n"
+            f"{counted(plan.episodes, 'episode')} of {counted(len(plan.cells), 'cell')} in {folder}\n"
             f"  driven now {now} in {self.seconds:.1f} s ({now / max(self.seconds, 1e-9):.2f} episodes/s)\n"
             "  status     "
             + ", ".join(f"{name} {n}" for name, n in status.items() if n)
-            + "".join(f"\n  not comparable: {_count(n, 'episode')}: {why}" for why, n in unfit.items())
+            + "".join(f"\n  not comparable: {counted(n, 'episode')}: {why}" for why, n in unfit.items())
         )
 
 
@@ -213,6 +214,7 @@ def driven(name: str, plan: Plan, engine: Engine, store: Store, folder: Path) ->
     """Drive the missing episodes, with progress, and export all."""
     from cosim.batch import execution
     from cosim.report.run_folder import export
+    from cosim.report.wording import counted
     from cosim.workers.progress import Progress
 
     done = len(store.keys())
@@ -223,17 +225,13 @@ def driven(name: str, plan: Plan, engine: Engine, store: Store, folder: Path) ->
         try:
             faults = execution.drive(plan, store, engine, folder / "outputs", progress)
         except KeyboardInterrupt:
-            kept = f"{len(store.keys())} of {_count(plan.episodes, 'episode')} are kept"
+            kept = f"{len(store.keys())} of {counted(plan.episodes, 'episode')} are kept"
             print(f"cosim: {kept}: the same command with --resume goes on", file=sys.stderr)
             raise
     seconds = time.monotonic() - began
     rows = store.rows()
     summary = export(folder, rows, execution.manifest(plan, store), plan.episodes)
     return Driven(rows, summary, faults, done, seconds)
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'s' * (number != 1)}"
 
 
 def _warn(rows: Sequence[Mapping[str, Any]]) -> None:

@@ -104,8 +104,7 @@ class Payments(Earnings):
         """One decision."""
         terms = self.pay(step, tuple(step.decisions))
         self.totals += [t.total for t in terms.values()]
-        hits = [c for c in step.events.collisions if not c.insertion]
-        crashed = frozenset(v for c in hits for v in (c.collider, c.victim))
+        crashed = frozenset(v for c in step.events.collisions for v in c.vehicles)
         self._agent.pay(terms, crashed, frozenset(episode.histories))
 
 

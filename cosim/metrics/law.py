@@ -97,8 +97,8 @@ class StopLines(AvCounts):
         """Whether the AV is still in the junction without a collision; counts a collision with a foe."""
         foes = {foe for foe, _ in entry.foes}
         for c in now.events.collisions:
-            pair = {c.collider, c.victim}
-            if not c.insertion and c.time >= entry.time and entry.vehicle in pair and pair & foes:
+            pair = {*c.vehicles}
+            if c.time >= entry.time and entry.vehicle in pair and pair & foes:
                 self._way += 1
                 self._tell(entry, now.time, f"touched {min(pair & foes)}, who had the right of way")
                 return False

@@ -30,8 +30,7 @@ class MissionSuccess:
         if not self._applies:
             return
         for collision in snapshot.events.collisions:  # they precede this frame's positions
-            if not collision.insertion:
-                self._crashed.update((collision.collider, collision.victim))
+            self._crashed.update(collision.vehicles)
         self._standing.difference_update(snapshot.events.arrived)
         if self._auto:  # its route may end before any goal lane
             self._reach(snapshot, self._reached.keys() & snapshot.events.arrived)

@@ -17,8 +17,7 @@ class Trips(AvCounts):
     def add(self, snapshot: Snapshot) -> None:
         super().add(snapshot)
         for collision in snapshot.events.collisions:
-            if not collision.insertion:
-                self._crashed.update((collision.collider, collision.victim))
+            self._crashed.update(collision.vehicles)
         if snapshot.events.arrived:
             self._completed.update(self._known.intersection(snapshot.events.arrived) - self._crashed)
         if snapshot.events.departed:

@@ -156,7 +156,7 @@ def _reasons(group: Group) -> str:
 
 
 def _pairs(count: int) -> str:
-    return f"{count} pair{'s' * (count != 1)}"
+    return wording.counted(count, "pair")
 
 
 def _wrapped(note: str, indent: str = "  ") -> list[str]:

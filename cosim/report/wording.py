@@ -81,6 +81,11 @@ def p_value(p: float) -> str:
     return "p < 0.001" if p < 0.001 else f"p {p:.2g}"
 
 
+def counted(number: int, noun: str) -> str:
+    """`1 pair`, `2 pairs`."""
+    return f"{number} {noun}{'s' * (number != 1)}"
+
+
 def group(identity: Mapping[str, Any]) -> str:
     """`merge / contested / idm / moderate / unguarded / svo 45 / lc2013`."""
     forms = {

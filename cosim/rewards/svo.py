@@ -32,7 +32,7 @@ class RewardP:
     def __call__(self, step: RewardStep) -> dict[str, RewardTerms]:
         """The terms of each of `step.avs`."""
         config, after, svo = self.config, step.after.vehicles, step.svo
-        crashed = {name for c in step.collisions if not c.insertion for name in (c.collider, c.victim)}
+        crashed = {name for c in step.collisions for name in c.vehicles}
         utility = vehicle_utility(step.before, after, crashed, config)  # [n]
         alive = [name for name in step.avs if name in after.row]
         rows = np.array([after.row[name] for name in alive], dtype=np.int64)  # [a]

@@ -181,7 +181,7 @@ class Wrecks:
         new = []
         on_road = frozenset(sumo.vehicle.getIDList()) if collisions else frozenset()
         for c in collisions:
-            for name in () if c.insertion else (c.collider, c.victim):
+            for name in c.vehicles:
                 if name in on_road and name not in self._since:
                     self._since[name] = c.time
                     new.append(name)
